@@ -6,7 +6,7 @@ Source: Vehtari et al. (2021), Bayesian Analysis 16(2) (R-hat, ESS); Vehtari et 
 
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from polar_bayes.diagnostics.parameters import (
     Scalar,
     with_entries,
 )
-from polar_bayes.diagnostics.view import FitView, once, view_of
+from polar_bayes.diagnostics.view import FitView, Provenance, once, view_of
 from polar_bayes.inference.result import CENTRAL_95, bounds_of
 from polar_bayes.numerics.mcse import LARGEST_R_HAT, SMALLEST_ESS, TAILS
 from polar_bayes.numerics.psis import MAX_PARETO_K, smooth
@@ -241,7 +241,7 @@ def _draw_problems(fit: FitView) -> Iterator[str]:
         )
 
 
-def _out_of_range(scalar: Scalar, provenance: Mapping[str, Any]) -> tuple[str, np.ndarray]:
+def _out_of_range(scalar: Scalar, provenance: Provenance) -> tuple[str, np.ndarray]:
     """Finite draws outside the prior, or outside the physical range of the parameter."""
     least, most = RANGES.get(scalar.name, (-math.inf, math.inf))
     low, high = bounds_of(provenance, scalar.name)
@@ -336,7 +336,7 @@ def _corrections(weights: np.ndarray, found: Sequence[Scalar]) -> Iterator[str]:
         )
 
 
-def _mode_cautions(provenance: Mapping[str, Any]) -> Iterator[str]:
+def _mode_cautions(provenance: Provenance) -> Iterator[str]:
     weights = (provenance.get("modes") or {}).get("weights", [])
     # Weighted draws of all modes have told whether chains have their tails.
     compared = (provenance.get("tails") or {}).get("k_hat", math.inf) <= MAX_PARETO_K
@@ -399,7 +399,7 @@ def _estimate_cautions(fit: FitView) -> Iterator[str]:
         )
 
 
-def _reading_cautions(counts: Mapping[str, Any]) -> Iterator[str]:
+def _reading_cautions(counts: Provenance) -> Iterator[str]:
     total, masked = counts.get("views") or 0, counts.get("masked") or 0
     if total and masked / total > LIMITS.masked:
         yield (
@@ -414,7 +414,7 @@ def _reading_cautions(counts: Mapping[str, Any]) -> Iterator[str]:
             )
 
 
-def _reading_notes(counts: Mapping[str, Any]) -> Iterator[str]:
+def _reading_notes(counts: Provenance) -> Iterator[str]:
     """Readings at the edge of their range, as a mirror has near Brewster's angle, where few."""
     total = counts.get("views") or 0
     for name, count in (counts.get("at_margin") or {}).items():
@@ -425,7 +425,7 @@ def _reading_notes(counts: Mapping[str, Any]) -> Iterator[str]:
             )
 
 
-def setup_cautions(provenance: Mapping[str, Any]) -> tuple[str, ...]:
+def setup_cautions(provenance: Provenance) -> tuple[str, ...]:
     """A caution where nobody stated the set-up of a capture, whatever was made of it."""
     if provenance.get("scene_chosen_by") != "default":
         return ()

@@ -12,7 +12,6 @@ Stat. Assoc. 90, 773 (Bayes factors of alternative parts); Vovk & Wang (2021), A
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -27,7 +26,7 @@ from polar_bayes.diagnostics.limits import LIMITS
 from polar_bayes.diagnostics.parameters import Scalar, with_entries
 from polar_bayes.diagnostics.predictive import PredictiveCheck, predictive_checks
 from polar_bayes.diagnostics.residuals import residual_findings, residuals_of
-from polar_bayes.diagnostics.view import FitView, once, view_of
+from polar_bayes.diagnostics.view import FitView, Provenance, once, view_of
 from polar_bayes.errors import FitError
 from polar_bayes.inference.checks import (
     CARRIES,
@@ -168,7 +167,7 @@ def _carriers(found: Sequence[Scalar]) -> list[Scalar]:
     return [s for s in judged if s.is_material or s.label in carrying]
 
 
-def _absent_end(name: str, provenance: Mapping[str, Any]) -> float:
+def _absent_end(name: str, provenance: Provenance) -> float:
     """-1 or 1 where the low or the high end of the support is where its part is absent, else 0."""
     absent = absence(name)
     if absent is None:

@@ -17,7 +17,7 @@ import scipy.stats
 import xarray as xr
 
 from polar_bayes.diagnostics.parameters import Scalar
-from polar_bayes.diagnostics.view import FitView, once
+from polar_bayes.diagnostics.view import FitView, Provenance, once
 from polar_bayes.inference.result import CENTRAL_95, bounds_of
 from polar_bayes.priors import RANGES
 
@@ -145,7 +145,7 @@ def population_summary(result: xr.DataTree | FitView) -> pd.DataFrame:
 
 
 def _of_parameter(
-    name: str, found: Mapping[str, list[Scalar]], provenance: Mapping[str, Any]
+    name: str, found: Mapping[str, list[Scalar]], provenance: Provenance
 ) -> Iterator[Population]:
     for location in found[f"{name}_location"]:
         index = location.index.items()

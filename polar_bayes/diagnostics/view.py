@@ -16,6 +16,9 @@ from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.result import provenance_of
 
+type Provenance = Mapping[str, Any]
+"""How a result was made, as JSON holds it."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FitView:
@@ -30,7 +33,7 @@ class FitView:
     computed: dict[tuple[object, ...], Any] = dataclasses.field(default_factory=dict, repr=False)
 
     @functools.cached_property
-    def provenance(self) -> dict[str, Any]:
+    def provenance(self) -> Provenance:
         """How the fit was made; null entries are left out."""
         return provenance_of(self.result)
 

@@ -3,7 +3,6 @@
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -79,7 +78,7 @@ def plot_accuracy(result: Study, *, times: Sequence[str] | None = None) -> Figur
             Line2D([], [], ls="", marker=marker, mfc=fill, mec=GRAY, label=variation)
             for fill, (variation, marker) in zip(fills, markers.items(), strict=True)
         ]
-        place: Any = {"loc": "outside lower center", "ncols": 4 * len(shown)}
+        place: style.Look = {"loc": "outside lower center", "ncols": 4 * len(shown)}
         figure.legend(handles=handles, frameon=False, **place)
     return figure
 
@@ -97,7 +96,7 @@ def front_panel(axes: Axes, study: AccuracyView, time: str) -> None:
     axes.plot(front[time], front["error"], color=GRAY, lw=1.0, drawstyle="steps-post", zorder=1)
     for _, row in known.iterrows():
         given, color = row["override"] == AS_GIVEN, colors[row["method"]]
-        look: Any = {"mfc": color, "ms": 6.5, "zorder": 3}
+        look: style.Look = {"mfc": color, "ms": 6.5, "zorder": 3}
         look = look if given else {"mfc": "none", "ms": 4.5, "zorder": 2}
         marker = markers[row["override"]]
         axes.plot(row[time], row["error"], ls="", marker=marker, mec=color, **look)
@@ -134,7 +133,7 @@ def _name_methods(axes: Axes, known: pd.DataFrame, time: str, colors: dict[str, 
                 break
         taken.append(box)
         line = {"arrowstyle": "-", "color": colors[name], "lw": 0.6}
-        place: Any = {"xytext": (right, up), "textcoords": "offset points", "va": "center"}
+        place: style.Look = {"xytext": (right, up), "textcoords": "offset points", "va": "center"}
         axes.annotate(
             style.label_text(name),
             (float(row[time]), float(row["error"])),

@@ -26,6 +26,7 @@ from polar_bayes.calibration.verdict import (
     reading_ranks,
 )
 from polar_bayes.diagnostics.coverage import INTERVALS
+from polar_bayes.diagnostics.view import Provenance
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.inference.result import provenance_of
@@ -297,7 +298,7 @@ def _fit_facts(calibration: xr.DataTree) -> dict[str, str]:
     return facts
 
 
-def _provenance_facts(provenance: Mapping[str, Any]) -> Iterator[page.Block]:
+def _provenance_facts(provenance: Provenance) -> Iterator[page.Block]:
     """How the calibration was made, in titled groups of names and values."""
     titles = {
         "truth": "What captures were simulated by, where it differs from what is fitted",

@@ -1,7 +1,6 @@
 """The report of several fits of one capture: which predicts best, and where they disagree."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -11,6 +10,7 @@ from matplotlib.lines import Line2D
 
 from polar_bayes.diagnostics.compare import FitComparison, compare_fits
 from polar_bayes.diagnostics.limits import LIMITS
+from polar_bayes.diagnostics.view import Provenance
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import page, style, text
@@ -20,11 +20,6 @@ from polar_bayes.reporting.text import CLEAR, DASH, column, interval, number, or
 from polar_bayes.repr_html import Row, Table
 
 COLORS = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY, GRAY)
-ASKED = (
-    *("method", "settings", "model", "model_settings", "scene", "scene_parts", "links", "priors"),
-    *("fixed", "largest_view_zenith", "seed", "precision"),
-)
-"""Entries of the provenance in which fits may differ."""
 
 
 @style.styled
@@ -54,7 +49,7 @@ def plot_comparison(comparison: FitComparison) -> Figure:
         for name, row in finite.xs(label, level="parameter").iterrows():
             at, color = -fits.index(str(name)), colors[str(name)]
             ends = [row["q2.5"], row["q97.5"]]
-            line: Any = "-"
+            line: str | tuple[int, tuple[int, int]] = "-"
             if not np.isfinite(ends).all():  # a point fit
                 ends = [row["mean"] - 2.0 * row["sd"], row["mean"] + 2.0 * row["sd"]]
                 line = (0, (2, 1))
@@ -149,7 +144,7 @@ def sensitivity_table(comparison: FitComparison) -> Table | None:
     )
 
 
-def settings_table(provenances: Mapping[str, Mapping[str, Any]]) -> Table:
+def settings_table(provenances: Mapping[str, Provenance]) -> Table:
     """What the fits were asked for, where it is not the same for all."""
     settings = [_settings(each) for each in provenances.values()]
     rows = []
@@ -163,9 +158,12 @@ def settings_table(provenances: Mapping[str, Mapping[str, Any]]) -> Table:
     return Table(("asked for", *names), tuple(rows), names, "settings", caption, data)
 
 
-def _settings(provenance: Mapping[str, Any]) -> dict[str, str]:
+def _settings(provenance: Provenance) -> dict[str, str]:
     found = {}
-    for key in ASKED:
+    for key in (
+        *("method", "settings", "model", "model_settings", "scene", "scene_parts", "links"),
+        *("priors", "fixed", "largest_view_zenith", "seed", "precision"),
+    ):
         value = provenance.get(key)
         for part, each in (value if isinstance(value, Mapping) else {"": value}).items():
             if each is not None:

@@ -20,7 +20,7 @@ from polar_bayes.diagnostics.parameters import APPROXIMATIONS, is_hyperparameter
 from polar_bayes.diagnostics.population import population_summary, populations, shrinkage
 from polar_bayes.diagnostics.predictive import PROBABILITIES, PredictiveCheck, predictive_checks
 from polar_bayes.diagnostics.sensitivity import sensitivity
-from polar_bayes.diagnostics.view import FitView, view_of
+from polar_bayes.diagnostics.view import FitView, Provenance, view_of
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.checks import CAUTION, PROBLEM
 from polar_bayes.inference.files import sentences_of_auto
@@ -36,16 +36,10 @@ from polar_bayes.repr_html import Row, Table
 from polar_bayes.results import summary, verdict
 from polar_bayes.scenes.sentences import scene_sentences, scene_table
 
-SHARED_GROUP = "Populations and spectra"
 INSTRUMENT_GROUP = "Instrument and noise"
 TRUTH = "true value"
 """A column that is left out where no true value is known."""
 
-SCALES = {
-    "log": "on the scale of its logarithm",
-    "log odds": "on the scale of its log odds",
-    "plain": "on its own scale",
-}
 MAX_POPULATIONS = 6
 PROVENANCE_GROUPS = {
     "model_settings": "Settings of the model",
@@ -72,7 +66,7 @@ def fit_table(
             titles[scalar.label] = parameter_title(scalar, fit.posterior)
             groups[scalar.label] = "" if scalar.is_material else INSTRUMENT_GROUP
             if is_hyperparameter(scalar.name, names):
-                groups[scalar.label] = SHARED_GROUP
+                groups[scalar.label] = "Populations and spectra"
     data = data.loc[list(titles)]
     if TRUTH in cells:
         truths = pd.Series({each.label: fit.truth(each) for each in fit.scalars})
@@ -329,8 +323,10 @@ def population_table(fit: FitView) -> Table:
         "a new member": lambda row: interval(row["new_q2.5"], row["new_q97.5"]),
         "pooling factor": column("pooling", ".2f"),
     }
+    scales = {"log": "the scale of its logarithm", "log odds": "the scale of its log odds"}
     members = {
-        each.label: f"{summary.loc[each.label, 'members']} members, {SCALES[each.scale]}"
+        each.label: f"{summary.loc[each.label, 'members']} members, "
+        f"on {scales.get(each.scale, 'its own scale')}"
         for each in populations(fit)
     }
     return page.make_table("fit.population", cells, summary, descriptions=members)
@@ -563,7 +559,7 @@ def _accuracy(result: xr.DataTree) -> Iterator[page.Block]:
         yield study_table(study)
 
 
-def provenance_facts(provenance: Mapping[str, Any]) -> list[page.Block]:
+def provenance_facts(provenance: Provenance) -> list[page.Block]:
     """How the fit was made, in titled groups of names and values; swapped parts are marked."""
     keys = ["method", "settings", "model", "scene", "scene_parts", "seed", "precision"]
     keys += ["chain_method", "step_size_halvings", "largest_view_zenith"]
@@ -595,7 +591,7 @@ def provenance_facts(provenance: Mapping[str, Any]) -> list[page.Block]:
     ]
 
 
-def _counts(counts: Mapping[str, Any]) -> dict[str, Any]:
+def _counts(counts: Provenance) -> dict[str, Any]:
     """Numbers of readings that were fitted, masked or set aside."""
     found = {"all": counts.get("views"), "fitted": counts.get("used")}
     found |= {"masked (valid=False)": counts.get("masked")}

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,6 +13,7 @@ from matplotlib.figure import Figure
 
 from polar_bayes.diagnostics.coverage import INTERVALS, map_coverage, map_scalars
 from polar_bayes.diagnostics.parameters import Scalar
+from polar_bayes.diagnostics.view import Provenance
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.batching import IMAGE, MIN_VIEWS, Status, cut
 from polar_bayes.inference.result import provenance_of
@@ -56,11 +56,7 @@ CHECKS = {
 
 # --- Figures --------------------------------------------------------------------------------------
 
-MAX_PIXELS = 800
-"""Longest side of a figure; of larger images every second, third, ... pixel is drawn."""
-
 NO_ANSWER = "#dadada"
-APPROACH_COLORS = (NO_ANSWER, SKY, BLUE, GREEN, ORANGE, PURPLE)
 STATUS_COLORS = {
     "good": BLUE,
     "masked": NO_ANSWER,
@@ -111,15 +107,16 @@ def plot_maps(maps: xr.Dataset, *, wavelength: float | None = None) -> Figure:
         _draw_values(panel(0, at), shown[name], title, "viridis")
         _draw_values(panel(1, at), high - low, "95% width", "cividis")
     _draw_values(panel(2, 0), shown["pareto_k"], "Pareto k", "magma", limits=(0.0, 1.0))
-    _draw_flags(panel(2, 1), shown["approach"], APPROACH_COLORS)
+    _draw_flags(panel(2, 1), shown["approach"], (NO_ANSWER, SKY, BLUE, GREEN, ORANGE, PURPLE))
     status = checked_status(shown)
     colors = [STATUS_COLORS.get(each, NO_ANSWER) for each in flag_meanings(status).values()]
     _draw_flags(panel(2, 2), status, colors)
     return figure
 
 
-def _pixel_step(maps: xr.Dataset) -> int:
-    return max(1, -(-max(maps.sizes[dim] for dim in IMAGE) // MAX_PIXELS))
+def _pixel_step(maps: xr.Dataset, most: int = 800) -> int:
+    """Of images with more pixels a side every second, third, ... one is drawn."""
+    return max(1, -(-max(maps.sizes[dim] for dim in IMAGE) // most))
 
 
 def _at_wavelength(maps: xr.Dataset, wavelength: float | None) -> tuple[xr.Dataset, str]:
@@ -217,9 +214,6 @@ TRUST = ("pareto_k", "approach", "status")
 UNCHECKED = "laplace"
 """The method whose draws nothing checks in a map."""
 
-MAX_COLUMNS = 4
-"""Parameters of one figure: more would be too small to read."""
-
 
 def map_card(result: xr.Dataset) -> page.Card:
     """The card of a map."""
@@ -296,7 +290,7 @@ def _check_uncorrected(maps: xr.Dataset, truth: xr.Dataset | None, uncorrected: 
         raise FitError("it was corrected as well", where=where, hint=hint)
 
 
-def _name(maps: xr.Dataset, provenance: Mapping[str, Any], truth: xr.Dataset | None) -> str:
+def _name(maps: xr.Dataset, provenance: Provenance, truth: xr.Dataset | None) -> str:
     """The name of the capture, or of the file of the map."""
     file = Path(str(maps.encoding.get("source", "map"))).stem
     names = [text.capture_name(provenance, ""), maps.attrs.get("name")]
@@ -320,8 +314,8 @@ def _pictures(maps: xr.Dataset, scalars: Sequence[Scalar]) -> Iterator[page.Pict
     names = [name for name in dims if dims[name] <= {"wavelength"}]
     step = _pixel_step(maps)
     thinned = f" Of every {step} x {step} pixels one is drawn." if step > 1 else ""
-    for at in range(0, len(names), MAX_COLUMNS):
-        some = names[at : at + MAX_COLUMNS]
+    for at in range(0, len(names), 4):  # more columns would be too small to read
+        some = names[at : at + 4]
         spectral = [name for name in some if "wavelength" in dims[name]]
         for turn, wavelength in enumerate(_wavelengths(maps) if spectral else [None]):
             shown = some if turn == 0 else spectral

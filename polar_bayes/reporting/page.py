@@ -29,15 +29,6 @@ from polar_bayes.repr_html import Row, Table
 from polar_bayes.results import kind_of
 
 PAGE = "index.html"
-MARK, MARK_BYTES = b'<meta name="generator" content="polar_bayes">', 1024
-"""Every page has this mark among its first bytes."""
-
-FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""A spreadsheet runs a text that begins with one of these."""
-
-LONG_TABLE = 40
-"""Tables with more rows scroll in a box of their own."""
-
 
 type Card = tuple[list[str], Table, bool]
 """What `polar_bayes.show` has of a result: sentences, a table, and whether it may be used."""
@@ -187,12 +178,13 @@ def _template() -> Template:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals |= {"csv_link": csv_link, "long_table": LONG_TABLE}
+    # Tables with more rows scroll in a box of their own.
+    environment.globals |= {"csv_link": csv_link, "long_table": 40}
     return environment.get_template("page.html.j2")
 
 
 @functools.cache
-def _captions() -> dict[str, dict[str, Any]]:
+def _captions() -> dict[str, Any]:
     file = importlib.resources.files("polar_bayes.reporting") / "templates" / "captions.toml"
     return tomllib.loads(file.read_text(encoding="utf-8"))
 
@@ -265,7 +257,7 @@ def write_page(
 
 def _is_page(file: Path) -> bool:
     try:
-        return MARK in file.read_bytes()[:MARK_BYTES]
+        return b'<meta name="generator" content="polar_bayes">' in file.read_bytes()[:1024]
     except OSError:
         return False
 
@@ -280,4 +272,6 @@ def csv_link(table: pd.DataFrame, first: str) -> str:
 
 
 def _escape_formula(value: object) -> object:
-    return f"'{value}" if isinstance(value, str) and value.startswith(FORMULA) else value
+    # A spreadsheet runs a text that begins with one of these.
+    is_run = isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r"))
+    return f"'{value}" if is_run else value

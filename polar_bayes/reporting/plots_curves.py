@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -24,7 +23,6 @@ LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
 
 # --- Readings against view zenith -----------------------------------------------------------------
 
-MAX_AZIMUTHS = 4
 MAX_ROWS = 6
 COLUMNS = 3
 
@@ -215,11 +213,11 @@ def _panels_by_curve(shown: list[xr.Dataset], label: str) -> tuple[Figure, Panel
     return figure, panels
 
 
-def _azimuths(found: list[xr.Dataset]) -> list[float]:
+def _azimuths(found: list[xr.Dataset], most: int = 4) -> list[float]:
     """The distinct azimuths between view and light, to the degree; none if there are many."""
     azimuths = np.concatenate([curve["azimuth"] for curve in found])
     distinct = sorted(set(np.round(azimuths[np.isfinite(azimuths)])), reverse=True)
-    return [float(each) for each in distinct] if len(distinct) <= MAX_AZIMUTHS else []
+    return [float(each) for each in distinct] if len(distinct) <= most else []
 
 
 def _azimuth_title(azimuth: float) -> str:
@@ -254,7 +252,7 @@ def _draw_prediction(axes: Axes, curve: xr.Dataset) -> set[str]:
     if not zenith.size:
         return set()
     is_smooth = _is_smooth(curve)
-    line: dict[str, Any] = {"marker": "_", "ms": 7, "mew": 1.4, "ls": ""}
+    line: style.Look = {"marker": "_", "ms": 7, "mew": 1.4, "ls": ""}
     line = {"lw": 1.4} if is_smooth else line
     axes.plot(zenith, curve["center"].to_numpy(), color=BLUE, zorder=3, **line)
     # Where a reading is missing, so may be its error: the scatter there is not known.
@@ -272,7 +270,7 @@ def _draw_prediction(axes: Axes, curve: xr.Dataset) -> set[str]:
     return {"median", "half", "most"}
 
 
-def _reading_markers() -> dict[str, dict[str, Any]]:
+def _reading_markers() -> dict[str, style.Look]:
     edge = {"mec": style.text_color(), "mew": 0.5}
     return {
         "reading": {"ls": "none", "marker": "o", "ms": 3.4, "color": style.text_color()},
@@ -296,9 +294,7 @@ def _reading_handles() -> dict[str, Artist]:
 # --- Parameters against wavelength ----------------------------------------------------------------
 
 MAX_MEMBERS = 12
-MAX_DRAWS = 1000
 FINE = 61
-BEYOND = 0.05
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -333,7 +329,7 @@ def spectra(fit: FitView) -> dict[str, list[Spectrum]]:
         return {}
     wavelengths = fit.posterior["wavelength"].to_numpy().astype(float)
     low, high = wavelengths.min(), wavelengths.max()
-    beyond = min(BEYOND * (high - low), 0.5 * low)
+    beyond = min(0.05 * (high - low), 0.5 * low)
     between = np.union1d(np.linspace(low - beyond, high + beyond, FINE), wavelengths)
     bands = _bands(fit, between)
     return {
@@ -357,7 +353,7 @@ def _can_be_drawn(members: Mapping[str, Sequence[Scalar]]) -> bool:
 def _bands(fit: FitView, between: np.ndarray) -> dict[str, dict[int, np.ndarray]]:
     """Quantiles between the measured wavelengths, by parameter and number of the member."""
     result, posterior = fit.result, fit.posterior
-    step = max(1, posterior.sizes["chain"] * posterior.sizes["draw"] // MAX_DRAWS)
+    step = max(1, posterior.sizes["chain"] * posterior.sizes["draw"] // 1000)
     chosen = {"draw": slice(None, None, step)}
     lead = [str(d) for d in posterior.dims if d in ("patch", "material")]
     if len(lead) == 1:
@@ -428,7 +424,7 @@ def plot_spectrum(result: xr.DataTree | FitView, name: str) -> Figure:
     several = len(shown) > 1
     width, height = (8.2, 1.9) if several else (6.6, 2.9)
     columns = 3 if len(shown) != 4 else 2
-    size: dict[str, Any] = {"width": width, "panel_height": height, "header": 0.8}
+    size: style.Look = {"width": width, "panel_height": height, "header": 0.8}
     figure, panels = style.grid(len(shown), columns=columns, **size)
     for axes, each in zip(panels, shown, strict=True):
         _draw_spectrum(axes, each)
@@ -459,7 +455,7 @@ def _draw_spectrum(axes: Axes, each: Spectrum) -> None:
     else:
         axes.vlines(each.measured, each.levels[0], each.levels[4], color=BLUE, lw=1.1)
         axes.vlines(each.measured, each.levels[1], each.levels[3], color=BLUE, lw=3.6)
-        ring: dict[str, Any] = {"mfc": style.background(), "mec": BLUE, "ms": 4.5}
+        ring: style.Look = {"mfc": style.background(), "mec": BLUE, "ms": 4.5}
         axes.plot(each.measured, each.levels[2], "o", ls="", **ring)
         margin = 0.08 * np.ptp(each.measured)
         limits = each.measured[[0, -1]] + [-margin, margin]
@@ -470,8 +466,8 @@ def _draw_spectrum(axes: Axes, each: Spectrum) -> None:
 
 
 def _spectrum_handles(shown: Sequence[Spectrum]) -> list[Artist]:
-    dashes: dict[str, Any] = {"color": lighten(GRAY, 0.6), "lw": 0.9, "ls": (0, (2, 2))}
-    ring: dict[str, Any] = {"marker": "o", "mfc": style.background(), "ls": ""}
+    dashes: style.Look = {"color": lighten(GRAY, 0.6), "lw": 0.9, "ls": (0, (2, 2))}
+    ring: style.Look = {"marker": "o", "mfc": style.background(), "ls": ""}
     handles: list[Artist] = [
         Line2D([], [], color=BLUE, label="posterior median", **ring),
         Line2D([], [], color=BLUE, lw=3.6, label="50%"),

@@ -2,7 +2,6 @@
 
 import functools
 import itertools
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -39,10 +38,6 @@ from polar_bayes.reporting.style import (
     lighten,
     parameter_title,
 )
-
-MAX_PAIRED = 8
-MAX_POINTS = 800
-RANK_BINS = 20
 
 
 @once
@@ -81,7 +76,7 @@ def plot_pairs(result: xr.DataTree | FitView) -> Figure:
     fit = view_of(result)
     found = drawable(fit, material=True)
     found = [s for s in found if _first_material_first(s) == _first_material_first(found[0])]
-    found = found[:MAX_PAIRED]
+    found = found[:8]
     if len(found) < 2:
         raise _nothing_to_draw("plot_pairs", "two material parameters with draws")
     titles = [parameter_title(scalar, fit.posterior).split(", ") for scalar in found]
@@ -96,7 +91,7 @@ def plot_pairs(result: xr.DataTree | FitView) -> Figure:
         hspace=0.12, wspace=0.12,
     )  # fmt: skip
     draws = np.stack([scalar.draws.ravel() for scalar in found])
-    shown = np.linspace(0, draws.shape[1] - 1, min(MAX_POINTS, draws.shape[1])).astype(int)
+    shown = np.linspace(0, draws.shape[1] - 1, min(800, draws.shape[1])).astype(int)
     diverging = np.flatnonzero(np.asarray(fit.stats.get("diverging", np.empty(0))))
     correlation = np.corrcoef(draws)
     limits = [style.padded_range(values, 0.04) for values in draws]
@@ -116,7 +111,7 @@ def plot_pairs(result: xr.DataTree | FitView) -> Figure:
             xy = draws[[column, row]]
             axes.plot(*xy[:, shown], "o", color=BLUE, ms=1.6, mew=0, alpha=0.4, rasterized=True)
             if diverging.size:
-                cross: dict[str, Any] = {"color": VERMILLION, "ms": 4, "mew": 1.2}
+                cross: style.Look = {"color": VERMILLION, "ms": 4, "mew": 1.2}
                 axes.plot(*xy[:, diverging], "x", rasterized=True, **cross)
             _draw_truth(axes, truths[column], truths[row])
         _pair_ticks(axes, row, column, size)
@@ -150,11 +145,11 @@ def plot_ranks(result: xr.DataTree | FitView) -> Figure:
     found = [found[i] for i in worst]
     figure, panels = style.grid(len(found), panel_height=1.35, header=0.5)
     chains, length = found[0].draws.shape
-    edges = np.linspace(0.0, 1.0, RANK_BINS + 1)
+    edges = np.linspace(0.0, 1.0, 21)
     for axes, scalar in zip(panels, found, strict=True):
         order = np.argsort(np.argsort(scalar.draws.ravel(), kind="stable")) / scalar.draws.size
         for chain, own in enumerate(order.reshape(chains, length)):
-            share = np.histogram(own, edges)[0] * RANK_BINS / length
+            share = np.histogram(own, edges)[0] * (len(edges) - 1) / length
             color = CHAIN_COLORS[chain % len(CHAIN_COLORS)]
             axes.stairs(share, edges, color=color, lw=1.1, baseline=None)
         axes.axhline(1.0, color=GRAY, lw=0.8, ls="--")
@@ -274,7 +269,7 @@ def _scaled_histogram(
 
 
 def _draw_truth(axes: Axes, x: float, y: float) -> None:
-    line: dict[str, Any] = {"color": ORANGE, "lw": 1.2, "ls": "--", "zorder": 3}
+    line: style.Look = {"color": ORANGE, "lw": 1.2, "ls": "--", "zorder": 3}
     if np.isfinite(x):
         axes.axvline(x, **line)
     if np.isfinite(y):
@@ -305,18 +300,6 @@ def _nothing_to_draw(what: str, needed: str) -> FitError:
 # --- Shrinkage: members of a population without and with pooling ----------------------------------
 
 MAX_MEMBERS = 60
-MANY_MEMBERS = 30
-"""With more members rows are lower and labels smaller."""
-
-ROW_HEIGHT, LOW_ROW_HEIGHT = 0.24, 0.17
-OFFSET = 0.17
-"""The estimate alone is drawn above the middle of a row, the pooled one below, unit row."""
-
-REACH = 1.2
-"""How far the axis extends to estimates alone, in widths of the pooled range."""
-
-LOGARITHMIC = 15.0
-"""From this ratio of largest to smallest value on, a positive parameter has a log axis."""
 
 
 @style.styled
@@ -351,8 +334,8 @@ def plot_shrinkage(result: xr.DataTree | FitView, label: str) -> Figure:
     count = len(rows)
     chosen = np.linspace(0, count - 1, min(count, MAX_MEMBERS)).astype(int)
     rows = rows.iloc[chosen].reset_index(drop=True)
-    is_dense = len(rows) > MANY_MEMBERS
-    height = (LOW_ROW_HEIGHT if is_dense else ROW_HEIGHT) * len(rows)
+    is_dense = len(rows) > 30
+    height = (0.17 if is_dense else 0.24) * len(rows)
     figure = style.NotebookFigure(figsize=(7.0, max(height, 0.7) + 1.5), layout="constrained")
     axes = figure.subplots()
     axes.set_xlim(_shrinkage_limits(axes, population, whole, rows))
@@ -392,9 +375,7 @@ def _shrinkage_limits(
         [rows[["q2.5", "q97.5"]].to_numpy().ravel(), whole[["new_q2.5", "new_q97.5"]]]
     ).astype(float)
     is_log = bool(
-        population.scale == "log"
-        and pooled.min() > 0
-        and np.ptp(np.log(pooled)) > np.log(LOGARITHMIC)
+        population.scale == "log" and pooled.min() > 0 and np.ptp(np.log(pooled)) > np.log(15.0)
     )
     if is_log:
         axes.set_xscale("log")
@@ -406,16 +387,15 @@ def _shrinkage_limits(
     # A log axis has no values below zero: estimates alone that reach there are drawn at its end.
     with np.errstate(all="ignore"):
         others = forward(rows[["true", "unpooled", "unpooled_q2.5", "unpooled_q97.5"]].to_numpy())
-    near = np.clip(
-        others[np.isfinite(others)], pooled.min() - REACH * width, pooled.max() + REACH * width
-    )
+    reach = 1.2 * width
+    near = np.clip(others[np.isfinite(others)], pooled.min() - reach, pooled.max() + reach)
     low, high = style.padded_range(np.concatenate([pooled, near]), 0.03)
     return float(inverse(low)), float(inverse(high))
 
 
 def _draw_member(axes: Axes, at: float, row: pd.Series, *, size: float) -> None:
     low, high = axes.get_xlim()
-    above, below = at + OFFSET, at - OFFSET
+    above, below = at + 0.17, at - 0.17  # alone and pooled
     faint = lighten(PURPLE, 0.25)
     if np.isfinite(row["unpooled"]):
         seen = float(np.clip(row["unpooled"], low, high))
@@ -434,7 +414,7 @@ def _draw_member(axes: Axes, at: float, row: pd.Series, *, size: float) -> None:
         axes.plot([row["true"]], [below], zorder=6, **truth)
 
 
-def _hollow() -> dict[str, Any]:
+def _hollow() -> style.Look:
     """Marker of an estimate without pooling."""
     return {"mfc": style.background(), "mec": PURPLE, "mew": 1.1, "ms": 5}
 

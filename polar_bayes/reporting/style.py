@@ -76,6 +76,10 @@ QUANTITIES = {
 SHORT = {**QUANTITIES, "dop": "DoP", "q": "q", "u": "u"}
 
 
+type Look = dict[str, Any]
+"""Keyword arguments of matplotlib."""
+
+
 def styled[**P, R](draw: Callable[P, R]) -> Callable[P, R]:
     """Run a drawing function in the user's style, with the defaults here where it has none."""
 
@@ -187,7 +191,7 @@ def write_in_panel(axes: Axes, text: str) -> None:
     axes.text(0.5, 0.5, text, ha="center", transform=axes.transAxes, color=GRAY)
 
 
-def true_value_style() -> dict[str, Any]:
+def true_value_style() -> Look:
     """Marker of a true value."""
     return {"marker": "d", "ls": "", "mfc": ORANGE, "mec": background(), "ms": 6.5}
 
