@@ -56,18 +56,18 @@ class Kind:
     reports: str = ""
 
 
-def _describing(name: str, variable: str, table: str, sentences: str) -> Kind:
-    """A kind that describes and cannot fail, read by functions of the file that makes it."""
+def _describing(name: str, variable: str, source: str) -> Kind:
+    """A kind that describes and cannot fail, read by two functions of the file that makes it."""
 
     # That file computes with JAX, and is loaded for a result of this kind only.
-    def call(function: str, result: object) -> Any:
-        return pkgutil.resolve_name(f"polar_bayes.{function}")(result)
+    def call(what: str, result: object) -> Any:
+        return pkgutil.resolve_name(f"polar_bayes.{source}_{what}")(result)
 
     return Kind(
         name,
         applies=lambda result: isinstance(result, xr.Dataset) and variable in result,
-        summary=lambda result: call(table, result),
-        verdict=lambda result: Verdict(True, (), (), tuple(call(sentences, result))),
+        summary=lambda result: call("table", result),
+        verdict=lambda result: Verdict(True, (), (), tuple(call("sentences", result))),
     )
 
 
@@ -131,27 +131,10 @@ KINDS = (
         _map_verdict,
         reports="maps",
     ),
-    _describing(
-        "profile",
-        "prior_beyond",
-        "design.profile:profile_table",
-        "design.profile:profile_sentences",
-    ),
-    _describing(
-        "identification",
-        "prior_share",
-        "design.identify:identifiability_table",
-        "design.identify:identifiability_sentences",
-    ),
-    _describing(
-        "next views",
-        "interval_width",
-        "design.next_views:next_views_table",
-        "design.next_views:next_views_sentences",
-    ),
-    _describing(
-        "effects", "kept", "effects.choose:ledger_table", "effects.choose:ledger_sentences"
-    ),
+    _describing("profile", "prior_beyond", "design.profile:profile"),
+    _describing("identification", "prior_share", "design.identify:identifiability"),
+    _describing("next views", "interval_width", "design.next_views:next_views"),
+    _describing("effects", "kept", "scenes.effects:ledger"),
     Kind(
         "several fits",
         lambda result: (

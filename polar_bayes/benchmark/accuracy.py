@@ -151,19 +151,14 @@ def _trials(
 ) -> Trials:
     """Every method as given, then with every override that changes something."""
     if not isinstance(methods, Mapping) or not methods:
-        raise FitError(
-            "there is no method",
-            where="accuracy: methods",
-            hint="give methods by name, as in STUDY_METHODS",
-        )
+        hint = "give methods by name, as in STUDY_METHODS"
+        raise FitError("there is no method", where="accuracy: methods", hint=hint)
     trials: Trials = {}
     for name, method in methods.items():
         if not isinstance(method, AbstractMethod):
-            raise FitError(
-                f"a {type(method).__name__} is not a method",
-                where=f"accuracy: methods[{name!r}]",
-                hint="give settings such as polar_bayes.methods.Nuts()",
-            )
+            what = f"a {type(method).__name__} is not a method"
+            hint = "give settings such as polar_bayes.methods.Nuts()"
+            raise FitError(what, where=f"accuracy: methods[{name!r}]", hint=hint)
         trials[str(name), AS_GIVEN] = Trial(request, method)
     for override in overrides:
         for name, method in methods.items():

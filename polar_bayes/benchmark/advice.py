@@ -103,11 +103,8 @@ def accuracy_view(result: Study) -> AccuracyView:
     if pd.MultiIndex.from_arrays(
         [found[name].to_numpy() for name in ("method", "override")]
     ).has_duplicates:
-        raise FitError(
-            "two rows have one name",
-            where="accuracy",
-            hint="give what polar_bayes.accuracy returned",
-        )
+        hint = "give what polar_bayes.accuracy returned"
+        raise FitError("two rows have one name", where="accuracy", hint=hint)
     return AccuracyView(found)
 
 

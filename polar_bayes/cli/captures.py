@@ -43,13 +43,9 @@ def _save(capture: "Capture", out: Path) -> None:
 
 def _layout(capture: "Capture") -> str:
     """Lengths of the axes of a capture: `12 views x 4 wavelengths`."""
-    words = {"view": "view", "wavelength": "wavelength", "material": "material", "patch": "patch"}
-    sizes = {word: capture.sizes[dim] for dim, word in words.items() if dim in capture.sizes}
-    plural = {"patch": "patches"}
-    found = [
-        f"{size} {word if size == 1 else plural.get(word, f'{word}s')}"
-        for word, size in sizes.items()
-    ]
+    plural = {"view": "s", "wavelength": "s", "material": "s", "patch": "es"}
+    sizes = {dim: capture.sizes[dim] for dim in plural if dim in capture.sizes}
+    found = [f"{size} {dim}{'' if size == 1 else plural[dim]}" for dim, size in sizes.items()]
     if "y" in capture.sizes:
         found.append(f"{capture.sizes['y']} x {capture.sizes['x']} pixels")
     return " x ".join(found)
@@ -248,8 +244,8 @@ def polarizer(frames: tuple[tuple[float, Path], ...], out: Path, **options: Any)
 @option("--bin", type=int, default=2, help="Pixels averaged, a side.")
 def mosaic(frame: Path, layout: tuple[float, ...], out: Path, **options: Any) -> None:
     """Import one raw frame of a polarization camera."""
-    rows = layout[:2], layout[2:]
-    _save_image(pb.from_mosaic(frame, layout=rows, **_image_arguments(options)), out)
+    options["layout"] = layout[:2], layout[2:]
+    _save_image(pb.from_mosaic(frame, **_image_arguments(options)), out)
 
 
 def _save_image(capture: "Capture", out: Path) -> None:

@@ -67,8 +67,7 @@ def calibrate(
     """Simulate captures of this layout, fit each, and test the coverage of the intervals."""
     from polar_bayes.inference.result import provenance_of
 
-    data = pb.load_capture(capture)
-    settings = read_scene_options(settings)
+    data, settings = pb.load_capture(capture), read_scene_options(settings)
     store = out.with_name(f"{out.name}.fits")
     if resume and out.exists() and not store.exists():
         raise pb.FitError("nothing is left to resume", where=str(out), hint="give another --out")
@@ -122,8 +121,7 @@ def identify(
     **settings: Any,
 ) -> None:
     """Which parameters a capture determines, which trade off, and where to look next."""
-    data = pb.load_capture(capture)
-    settings = read_scene_options(settings)
+    data, settings = pb.load_capture(capture), read_scene_options(settings)
     with stages() as progress:
         settings["progress"] = progress
         results = {"parameters": pb.identify(data, **settings)}
@@ -169,8 +167,7 @@ def accuracy(
     **settings: Any,
 ) -> None:
     """What each method gets wrong for this capture, and what it costs in time."""
-    data = pb.load_capture(capture)
-    settings = read_scene_options(settings)
+    data, settings = pb.load_capture(capture), read_scene_options(settings)
     names = methods or tuple(pb.methods.STUDY_METHODS)
     settings["methods"] = {name: pb.methods.STUDY_METHODS[name] for name in names}
     quick = {

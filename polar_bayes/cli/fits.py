@@ -236,8 +236,7 @@ def regions(maps: Path, labels: Path, against: int | None, as_json: bool) -> Non
 @out_option(RESULT_FILE, "Ledger to write.", required=False)
 def effects(capture: Path, as_json: bool, out: Path | None, **settings: Any) -> None:
     """What each effect changes and costs; which of them this capture can see."""
-    data = pb.load_capture(capture)
-    settings = read_scene_options(settings)
+    data, settings = pb.load_capture(capture), read_scene_options(settings)
     with stages() as progress:
         ledger: Any = pb.choose_effects(data, progress=progress, **settings).ledger
     if out is not None:
@@ -276,8 +275,7 @@ def scene(source: Path | str, out: Path | None) -> None:
 @json_option
 def scenes(capture: Path, out: Path | None, as_json: bool, **settings: Any) -> int | None:
     """Compare scenes, from simple to complex; with --out, fit those that remain."""
-    data = pb.load_capture(capture)
-    settings = read_scene_options(settings)
+    data, settings = pb.load_capture(capture), read_scene_options(settings)
     method = settings.pop("method")
     found: Any
     with stages() as progress:

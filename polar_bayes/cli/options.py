@@ -37,11 +37,8 @@ class Name(click.ParamType):
     @override
     def convert(self, value: str | Path, param: Param, ctx: Context) -> str:
         if value not in self.names:
-            raise self.error(
-                f"no such {self.kind}",
-                where=f"{_flag(param)} {value}",
-                hint=f"give one of {', '.join(self.names)}",
-            )
+            where, hint = f"{_flag(param)} {value}", f"give one of {', '.join(self.names)}"
+            raise self.error(f"no such {self.kind}", where=where, hint=hint)
         return str(value)
 
 

@@ -79,17 +79,12 @@ def print_fit(result: "Fit", *, as_json: bool = False) -> int:
     if as_json:
         print_json(pb.diagnostics.json_summary(result))
     else:
-        _print_parameters(result)
+        columns = ["mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk"]
+        titles = ["mean", "sd", "2.5%", "97.5%", "R-hat", "ESS"]
+        print_frame(pb.summary(result)[columns].set_axis(titles, axis="columns"))
+        if words := list(_explanations(result)):
+            click.echo("\n".join(["", *words]))
     return print_verdict(result)
-
-
-def _print_parameters(result: "Fit") -> None:
-    """A row per parameter, and what those mean whose names do not say it."""
-    columns = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk")
-    titles = ["mean", "sd", "2.5%", "97.5%", "R-hat", "ESS"]
-    print_frame(pb.summary(result)[[*columns]].set_axis(titles, axis="columns"))
-    if words := list(_explanations(result)):
-        click.echo("\n".join(["", *words]))
 
 
 def _explanations(result: "Fit") -> Iterator[str]:
