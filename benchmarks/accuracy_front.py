@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 
 import polar_bayes as pb
 from polar_bayes.benchmark.accuracy import AS_GIVEN
-from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_table, time_column
+from polar_bayes.benchmark.advice import accuracy_table, accuracy_view, time_column
 from polar_bayes.reporting.accuracy import front_panel
 from polar_bayes.reporting.style import styled
 
@@ -81,7 +81,7 @@ def draw(studies: dict[str, xr.DataTree]) -> Figure:
     figure = Figure(figsize=(5.2 * columns, 3.7 * rows), layout="constrained")
     for at, (name, found) in enumerate(studies.items()):
         axes = figure.add_subplot(rows, columns, at + 1)
-        front_panel(axes, accuracy_dataset(found), "seconds_first")
+        front_panel(axes, accuracy_view(found), "seconds_first")
         axes.set_title(name, loc="left")
         axes.set_ylabel("largest error [posterior sd]" if at % columns == 0 else "")
     return figure
@@ -96,7 +96,7 @@ def table(studies: dict[str, xr.DataTree], trials: dict[str, tuple[str, float]])
     ]
     for name, found in studies.items():
         rows = pb.summary(found)
-        noise = float(accuracy_dataset(found).attrs["reference_error"])
+        noise = accuracy_view(found).resolved / 2.0
         cells = [_cell(rows, method) for method in pb.methods.STUDY_METHODS]
         lines.append(f"| {name} | " + " | ".join(cells) + f" | {noise:.2g} |")
     lines += [

@@ -6,6 +6,8 @@ from typing import override
 
 import pandas as pd
 
+type Frame = pd.DataFrame
+
 WIDTH = 80
 """Characters of a line where the output is no terminal."""
 

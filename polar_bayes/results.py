@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from polar_bayes.benchmark.advice import STUDY, accuracy_dataset, accuracy_sentences, accuracy_table
+from polar_bayes.benchmark.advice import STUDY, accuracy_sentences, accuracy_table, accuracy_view
 from polar_bayes.calibration.scores import is_calibrated
 from polar_bayes.calibration.verdict import (
     CALIBRATION,
@@ -34,7 +34,10 @@ from polar_bayes.paths import as_path, atomic_write, existing_file
 MIN_GOOD_SHARE = 0.95
 """Share of the pixels read that need an answer for a map to pass."""
 
-LABELED = xr.DataTree | xr.Dataset
+type Capture = xr.Dataset
+type Fit = xr.DataTree
+type Result = xr.DataTree | xr.Dataset
+"""A result of any kind."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,18 +56,18 @@ class Kind:
     reports: str = ""
 
 
-def _describing(name: str, variable: str, table: str, sentences: str) -> Kind:
-    """A kind that describes and cannot fail, read by functions of the file that makes it."""
+def _describing(name: str, variable: str, source: str) -> Kind:
+    """A kind that describes and cannot fail, read by two functions of the file that makes it."""
 
     # That file computes with JAX, and is loaded for a result of this kind only.
-    def call(function: str, result: object) -> Any:
-        return pkgutil.resolve_name(f"polar_bayes.{function}")(result)
+    def call(what: str, result: object) -> Any:
+        return pkgutil.resolve_name(f"polar_bayes.{source}_{what}")(result)
 
     return Kind(
         name,
         applies=lambda result: isinstance(result, xr.Dataset) and variable in result,
-        summary=lambda result: call(table, result),
-        verdict=lambda result: Verdict(True, (), (), tuple(call(sentences, result))),
+        summary=lambda result: call("table", result),
+        verdict=lambda result: Verdict(True, (), (), tuple(call("sentences", result))),
     )
 
 
@@ -74,10 +77,10 @@ def _calibration_verdict(calibration: xr.DataTree) -> Verdict:
     return Verdict(passed, () if passed else sentences, (), sentences if passed else ())
 
 
-def _accuracy_verdict(study: xr.DataTree | xr.Dataset) -> Verdict:
-    doubts = str(accuracy_dataset(study).attrs["reference_doubts"])
-    problems = (f"The reference is in doubt: {doubts}.",) if doubts else ()
-    return Verdict(not doubts, problems, (), tuple(accuracy_sentences(study)))
+def _accuracy_verdict(study: Result) -> Verdict:
+    view = accuracy_view(study)
+    problems = (f"The reference is in doubt: {view.doubts}.",) if view.doubts else ()
+    return Verdict(not view.doubts, problems, (), tuple(accuracy_sentences(view)))
 
 
 def _map_summary(maps: xr.Dataset) -> pd.DataFrame:
@@ -128,30 +131,15 @@ KINDS = (
         _map_verdict,
         reports="maps",
     ),
-    _describing(
-        "profile",
-        "prior_beyond",
-        "design.profile:profile_table",
-        "design.profile:profile_sentences",
-    ),
-    _describing(
-        "identification",
-        "prior_share",
-        "design.identify:identifiability_table",
-        "design.identify:identifiability_sentences",
-    ),
-    _describing(
-        "next views",
-        "interval_width",
-        "design.next_views:next_views_table",
-        "design.next_views:next_views_sentences",
-    ),
-    _describing(
-        "effects", "kept", "scenes.effects:ledger_table", "scenes.effects:ledger_sentences"
-    ),
+    _describing("profile", "prior_beyond", "design.profile:profile"),
+    _describing("identification", "prior_share", "design.identify:identifiability"),
+    _describing("next views", "interval_width", "design.next_views:next_views"),
+    _describing("effects", "kept", "scenes.effects:ledger"),
     Kind(
         "several fits",
-        lambda result: isinstance(result, Mapping) and not isinstance(result, LABELED),
+        lambda result: (
+            isinstance(result, Mapping) and not isinstance(result, xr.DataTree | xr.Dataset)
+        ),
         convergence.summary,  # refuses them, with a hint
         convergence.verdict,
         reports="comparison",
@@ -166,7 +154,7 @@ def kind_of(result: object) -> Kind:
     return next((kind for kind in KINDS if kind.applies(result)), KINDS[-1])
 
 
-def summary(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
+def summary(result: Result) -> pd.DataFrame:
     """The table of a result of any kind, numbers unrounded; printed, it shows every column.
 
     Args:
@@ -191,7 +179,7 @@ def summary(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
     return PrintedFrame(kind_of(result).summary(result))
 
 
-def verdict(result: xr.DataTree | xr.Dataset) -> Verdict:
+def verdict(result: Result) -> Verdict:
     """Whether the numbers of a result of any kind may be used, and what follows from them.
 
     A fit by sampling fails on any R-hat above 1.01, any effective sample size below 400 and any
@@ -218,7 +206,7 @@ def verdict(result: xr.DataTree | xr.Dataset) -> Verdict:
     return dataclasses.replace(judged, cautions=cautions)
 
 
-def save(result: xr.DataTree | xr.Dataset, path: str | os.PathLike[str]) -> None:
+def save(result: Result, path: str | os.PathLike[str]) -> None:
     """Write a result of any kind to a netCDF-4 file with a checksum, which `load` verifies.
 
     Args:
@@ -269,7 +257,7 @@ def load(path: str | os.PathLike[str], kind: str | None = None) -> Any:
     return result
 
 
-def _read(path: str | os.PathLike[str], wanted: str) -> tuple[xr.DataTree | xr.Dataset, str]:
+def _read(path: str | os.PathLike[str], wanted: str) -> tuple[Result, str]:
     """A tree, or the dataset of a store or of a file without groups, and the path as text."""
     if as_path(path, wanted).suffix == ".zarr":
         return open_map(path), str(path)

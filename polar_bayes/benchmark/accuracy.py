@@ -34,11 +34,7 @@ from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress, no_progress, with_progress
 
-REFERENCE_FOLD = 7
-"""Folded into the key of the reference, which shares no random number with a trial."""
-
 DIAGNOSTICS = ("r_hat", "k_hat", "effective_draws", "gradients", "densities")
-COSTS = ("seconds_again",)
 COSTS_OF_PROCESS = ("seconds_first", "peak_memory", "memory_before")
 """Costs that are known only where a trial has a process of its own."""
 
@@ -118,7 +114,8 @@ def accuracy(
     trials = _trials(request, STUDY_METHODS if methods is None else methods, tuple(overrides))
     show("reference", 0.0)
     with jax.enable_x64(True):
-        key = jax.random.fold_in(jax.random.key(seed), REFERENCE_FOLD)
+        # Folded, so that the reference shares no random number with a trial.
+        key = jax.random.fold_in(jax.random.key(seed), 7)
         key_search, key_draws = jax.random.split(key)
         problem = make_problem(request, key_search)
         reference_run = run_reference(reference or Reference(), problem, key_draws)
@@ -154,19 +151,14 @@ def _trials(
 ) -> Trials:
     """Every method as given, then with every override that changes something."""
     if not isinstance(methods, Mapping) or not methods:
-        raise FitError(
-            "there is no method",
-            where="accuracy: methods",
-            hint="give methods by name, as in STUDY_METHODS",
-        )
+        hint = "give methods by name, as in STUDY_METHODS"
+        raise FitError("there is no method", where="accuracy: methods", hint=hint)
     trials: Trials = {}
     for name, method in methods.items():
         if not isinstance(method, AbstractMethod):
-            raise FitError(
-                f"a {type(method).__name__} is not a method",
-                where=f"accuracy: methods[{name!r}]",
-                hint="give settings such as polar_bayes.methods.Nuts()",
-            )
+            what = f"a {type(method).__name__} is not a method"
+            hint = "give settings such as polar_bayes.methods.Nuts()"
+            raise FitError(what, where=f"accuracy: methods[{name!r}]", hint=hint)
         trials[str(name), AS_GIVEN] = Trial(request, method)
     for override in overrides:
         for name, method in methods.items():
@@ -184,7 +176,7 @@ def _row(trial: Trial | PolarBayesError, reference: ReferenceRun, *, fresh: bool
     """Distances, diagnostics and costs of one trial by name; NaN where it failed."""
     row: dict[str, Any] = {
         **{name: np.full(len(reference.labels), np.nan) for name in Distances._fields},
-        **dict.fromkeys((*DIAGNOSTICS, *COSTS, *COSTS_OF_PROCESS), np.nan),
+        **dict.fromkeys((*DIAGNOSTICS, "seconds_again", *COSTS_OF_PROCESS), np.nan),
     }
     try:
         if isinstance(trial, PolarBayesError):
@@ -198,8 +190,9 @@ def _row(trial: Trial | PolarBayesError, reference: ReferenceRun, *, fresh: bool
     )
     for name, values in distances(draws, expected)._asdict().items():
         row[name][theirs] = values
+    costs = ("seconds_again", *(COSTS_OF_PROCESS if fresh else ()))
     row |= {name: getattr(found.posterior, name) for name in DIAGNOSTICS}
-    row |= {name: getattr(found, name) for name in COSTS + (COSTS_OF_PROCESS if fresh else ())}
+    row |= {name: getattr(found, name) for name in costs}
     return row | {"problems": "; ".join(found.posterior.problems)}
 
 
@@ -209,7 +202,7 @@ def _dataset(
     draws = reference.draws.reshape(len(reference.labels), -1)
     columns: dict[str, tuple[Any, Any]] = {
         name: ("row", np.array([row[name] for row in rows], float))
-        for name in (*DIAGNOSTICS, *COSTS, *COSTS_OF_PROCESS)
+        for name in (*DIAGNOSTICS, "seconds_again", *COSTS_OF_PROCESS)
     }
     for name in Distances._fields:
         columns[name] = ("row", "parameter"), np.stack([row[name] for row in rows])

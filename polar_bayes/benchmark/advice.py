@@ -1,11 +1,13 @@
 """Table, Pareto front and sentences of an accuracy study."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
+from polar_bayes.diagnostics.finding import join
 from polar_bayes.errors import FitError
 from polar_bayes.inference.files import ACCURACY, COMMON_PROVENANCE, FIT, Schema
 
@@ -18,26 +20,79 @@ STUDY = Schema(
     provenance=COMMON_PROVENANCE,
 )
 
-RESOLVED = 2.0
-"""Standard errors of the reference from which an error counts as different from 0."""
-
-MUCH_FASTER = 2.0
-"""Ratio of times from which a method is advised for most parameters alone."""
-
-FASTER = 1.2
-"""Ratio of times below which they count as equal: times differ so from run to run."""
-
-TOLERANCE = 0.1
-TIMES = ("seconds_first", "seconds_again")
 NUMBERS = (
     *("r_hat", "k_hat", "effective_draws", "gradients", "densities"),
-    *(*TIMES, "peak_memory"),
+    *("seconds_first", "seconds_again", "peak_memory"),
 )
-TEXTS = ("method", "override", "problems")
 
 
-def accuracy_dataset(result: xr.DataTree | xr.Dataset) -> xr.Dataset:
-    """The group `accuracy` of a tree."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class AccuracyView:
+    """An accuracy study that was checked, and what is computed of it once."""
+
+    study: xr.Dataset
+
+    @functools.cached_property
+    def errors(self) -> pd.DataFrame:
+        """The larger error of mean and sd of every row and parameter, in reference sds."""
+        names = zip(self.study["method"].to_numpy(), self.study["override"].to_numpy(), strict=True)
+        return pd.DataFrame(
+            self._larger("mean_error", "sd_error"),
+            index=[str(name) if how == AS_GIVEN else f"{name}, {how}" for name, how in names],
+            columns=[str(label) for label in self.study["parameter"].to_numpy()],
+        )
+
+    @functools.cached_property
+    def table(self) -> pd.DataFrame:
+        """The table of `accuracy_table`."""
+        error = np.fmax.reduce(self.errors.to_numpy(), axis=1)
+        distance = np.abs(self.study["wasserstein"].to_numpy())
+        table = pd.DataFrame(
+            {
+                "error": error,
+                "worst": self.errors.fillna(-np.inf).idxmax(axis=1),
+                "resolved": error > self.resolved,
+                "interval": np.fmax.reduce(self._larger("low_error", "high_error"), axis=1),
+                "wasserstein": np.fmax.reduce(distance, axis=1),
+                **{name: self.study[name].to_numpy() for name in NUMBERS},
+                **{
+                    name: [str(x) for x in self.study[name].to_numpy()]
+                    for name in ("method", "override", "problems")
+                },
+            },
+            index=pd.Index(self.errors.index, name="row"),
+        )
+        table["on_front"] = pareto_front(table[time_column(table)].to_numpy(), error)
+        return table
+
+    @property
+    def is_given(self) -> np.ndarray:
+        """Which rows are of a method as it was given."""
+        return np.asarray(self.study["override"].to_numpy() == AS_GIVEN)
+
+    @property
+    def resolved(self) -> float:
+        """The error from which on one counts as different from 0, in reference sds."""
+        # Twice the standard error of the reference.
+        return 2.0 * float(self.study.attrs["reference_error"])
+
+    @property
+    def doubts(self) -> str:
+        """What speaks against the reference; empty where nothing does."""
+        return str(self.study.attrs["reference_doubts"])
+
+    def _larger(self, *names: str) -> np.ndarray:
+        return np.asarray(np.fmax(*(np.abs(self.study[name].to_numpy()) for name in names)))
+
+
+type Study = xr.DataTree | xr.Dataset | AccuracyView
+"""What holds an accuracy study."""
+
+
+def accuracy_view(result: Study) -> AccuracyView:
+    """A view itself, or that of a study or of a fit that holds one, which is checked."""
+    if isinstance(result, AccuracyView):
+        return result
     if isinstance(result, xr.Dataset):
         result = xr.DataTree(children={"accuracy": xr.DataTree(result)})
     # The tree of a fit may hold a study, and has checks of its own.
@@ -45,55 +100,22 @@ def accuracy_dataset(result: xr.DataTree | xr.Dataset) -> xr.Dataset:
     check = FIT.check if is_fit and "accuracy" in result.children else STUDY.check
     check(result, "accuracy")
     found = result["accuracy"].to_dataset().transpose("row", "parameter", ...)
-    if pd.MultiIndex.from_arrays([found[name].to_numpy() for name in TEXTS[:2]]).has_duplicates:
-        raise FitError(
-            "two rows have one name",
-            where="accuracy",
-            hint="give what polar_bayes.accuracy returned",
-        )
-    return found
+    if pd.MultiIndex.from_arrays(
+        [found[name].to_numpy() for name in ("method", "override")]
+    ).has_duplicates:
+        hint = "give what polar_bayes.accuracy returned"
+        raise FitError("two rows have one name", where="accuracy", hint=hint)
+    return AccuracyView(found)
 
 
-def accuracy_table(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
+def accuracy_table(result: Study) -> pd.DataFrame:
     """One row for each method and override, the errors of the worst parameter.
 
     `error` is the largest of mean and sd in reference sds, `worst` the parameter that has it;
     `resolved`: it is more than twice the reference's own standard error; `interval` is the largest
     of both ends; `on_front`: nothing is both faster and better. Seconds [s], memory [MiB].
     """
-    found = accuracy_dataset(result)
-    errors = parameter_errors(found)
-    error = np.fmax.reduce(errors.to_numpy(), axis=1)
-    ends = _larger(found, "low_error", "high_error")
-    table = pd.DataFrame(
-        {
-            "error": error,
-            "worst": errors.fillna(-np.inf).idxmax(axis=1),
-            "resolved": error > RESOLVED * float(found.attrs["reference_error"]),
-            "interval": np.fmax.reduce(ends, axis=1),
-            "wasserstein": np.fmax.reduce(np.abs(found["wasserstein"].to_numpy()), axis=1),
-            **{name: found[name].to_numpy() for name in NUMBERS},
-            **{name: [str(x) for x in found[name].to_numpy()] for name in TEXTS},
-        },
-        index=pd.Index(errors.index, name="row"),
-    )
-    table["on_front"] = pareto_front(table[time_column(table)].to_numpy(), error)
-    return table
-
-
-def parameter_errors(result: xr.DataTree | xr.Dataset) -> pd.DataFrame:
-    """The larger error of mean and sd of every parameter, in reference sds."""
-    found = accuracy_dataset(result)
-    rows = zip(found["method"].to_numpy(), found["override"].to_numpy(), strict=True)
-    return pd.DataFrame(
-        _larger(found, "mean_error", "sd_error"),
-        index=[str(name) if how == AS_GIVEN else f"{name}, {how}" for name, how in rows],
-        columns=[str(label) for label in found["parameter"].to_numpy()],
-    )
-
-
-def _larger(found: xr.Dataset, one: str, other: str) -> np.ndarray:
-    return np.fmax(np.abs(found[one].to_numpy()), np.abs(found[other].to_numpy()))
+    return accuracy_view(result).table
 
 
 def pareto_front(seconds: np.ndarray, error: np.ndarray) -> np.ndarray:
@@ -107,10 +129,10 @@ def pareto_front(seconds: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 def time_column(table: pd.DataFrame) -> str:
     """The column of times that is filled in: of the first fit, where it was measured."""
-    return TIMES[0] if table[TIMES[0]].notna().any() else TIMES[1]
+    return "seconds_first" if table["seconds_first"].notna().any() else "seconds_again"
 
 
-def accuracy_sentences(result: xr.DataTree | xr.Dataset, tolerance: float = TOLERANCE) -> list[str]:
+def accuracy_sentences(result: Study, tolerance: float = 0.1) -> list[str]:
     """Which method to use for this capture.
 
     Args:
@@ -129,12 +151,10 @@ def accuracy_sentences(result: xr.DataTree | xr.Dataset, tolerance: float = TOLE
         raise FitError(
             f"tolerance is {tolerance}", where="accuracy_sentences", hint="give a number above 0"
         )
-    found = accuracy_dataset(result)
-    table, errors = accuracy_table(found), parameter_errors(found)
-    given = table["override"] == AS_GIVEN
-    sentences = [_advice(table[given], errors[given.to_numpy()], tolerance)]
-    if doubts := found.attrs["reference_doubts"]:
-        sentences.append(f"Take it with care: of the reference itself, {doubts}.")
+    view = accuracy_view(result)
+    sentences = [_advice(view.table[view.is_given], view.errors[view.is_given], tolerance)]
+    if view.doubts:
+        sentences.append(f"Take it with care: of the reference itself, {view.doubts}.")
     return sentences
 
 
@@ -159,14 +179,15 @@ def _advice(table: pd.DataFrame, errors: pd.DataFrame, tolerance: float) -> str:
         times = seconds[fastest] / seconds[quick]
         return (
             f"{quick} is within {rest:.2g} sd here and {times:.2g} times faster than {fastest}, "
-            f"but for {_listed(missed)}; use {fastest} for {'it' if len(missed) == 1 else 'them'}."
+            f"but for {join(missed)}; use {fastest} for {'it' if len(missed) == 1 else 'them'}."
         )
     said = f"{fastest} is within {table['error'][fastest]:.2g} sd here"
     slower = table[good & table.index.str.startswith("nuts") & (seconds > seconds[fastest])]
     if len(slower):
         other = str(seconds[slower.index].idxmin())
         times = seconds[other] / seconds[fastest]
-        faster = f"{times:.2g} times faster than" if times >= FASTER else "as fast as"
+        # Times differ by a fifth from run to run.
+        faster = f"{times:.2g} times faster than" if times >= 1.2 else "as fast as"
         said += f" and {faster} {other}"
     return f"{said}; use it."
 
@@ -174,15 +195,11 @@ def _advice(table: pd.DataFrame, errors: pd.DataFrame, tolerance: float) -> str:
 def _partly(
     errors: pd.DataFrame, seconds: pd.Series, fastest: str, tolerance: float
 ) -> tuple[str, list[str]] | None:
-    """The fastest row good for most parameters, and what it misses, if it is much faster."""
+    """The fastest row good for most parameters, and what it misses, if it is twice as fast."""
     for name in seconds.sort_values(kind="stable").index:
         missed = [label for label, error in errors.loc[name].items() if not error <= tolerance]
-        if seconds[fastest] < MUCH_FASTER * seconds[name]:
+        if seconds[fastest] < 2.0 * seconds[name]:
             return None
         if 0 < len(missed) <= errors.shape[1] / 2.0:
             return str(name), [str(label) for label in missed]
     return None
-
-
-def _listed(names: list[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

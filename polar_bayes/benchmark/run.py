@@ -45,11 +45,6 @@ try:
 except ImportError:  # not on Windows, where memory is then not known
     resource = None  # type: ignore[assignment]
 
-MEBIBYTE = 2**20
-
-POINT_DRAWS = 1000
-"""Of the normal distribution around a point estimate."""
-
 
 class Trial(NamedTuple):
     """A method, and the request that it is run on."""
@@ -105,29 +100,25 @@ def _run(trial: Trial, seed: int) -> tuple[PosteriorDraws, tuple[str, ...], np.n
     return found, *labeled(problem, found.z)
 
 
-def sample_point(found: PosteriorDraws, key: Array) -> PosteriorDraws:
+def sample_point(found: PosteriorDraws, key: Array, count: int = 1000) -> PosteriorDraws:
     """Draws of the normal distribution that the standard errors of a point estimate stand for."""
     # What the readings do not determine has no standard error, and is drawn without any width.
     covariance = np.asarray(found.covariance)
     free = np.isinf(np.diagonal(covariance))
     finite = np.where(free[:, None] | free, 0.0, covariance)
-    shape = CHAINS, POINT_DRAWS // CHAINS
+    shape = CHAINS, count // CHAINS
     z = numpy_generator(key).multivariate_normal(found.z[0, 0], finite, shape)
-    return dataclasses.replace(found, z=z, stats={}, effective_draws=float(POINT_DRAWS))
+    return dataclasses.replace(found, z=z, stats={}, effective_draws=float(count))
 
 
 def _memory() -> float:
     if resource is None:
         return math.nan
     unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / MEBIBYTE
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
 
 
 # --- A trial in a process of its own: nothing is compiled yet, nothing else takes memory ----------
-
-
-STDERR_TAIL = 300
-"""Characters of the standard error of a process that failed, for its message."""
 
 
 def run_in_subprocess(trial: Trial) -> TrialResult:
@@ -146,7 +137,7 @@ def run_in_subprocess(trial: Trial) -> TrialResult:
                     process.kill()  # an exception must not wait for it
         if not target.exists():
             raise FitError(
-                f"its process ended with {process.returncode}: {stderr[-STDERR_TAIL:].strip()}",
+                f"its process ended with {process.returncode}: {stderr[-300:].strip()}",
                 where="accuracy",
                 hint="try the same method with polar_bayes.fit, or a smaller capture",
             )
@@ -174,10 +165,6 @@ def _run_file(source: Path, target: Path) -> None:
 
 
 # --- Overrides of the request or method: facets, effects, precision, number of draws --------------
-
-
-NEARLY = 0.1
-"""Relative difference between the draws that an override is called by and those that there are."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -264,7 +251,7 @@ class DrawsOverride(_Factor):
         if changed is None or not before or not after:
             return None
         # Numbers are rounded, or have a least: what is called so must be so.
-        is_so = abs(after / before / self.factor - 1.0) < NEARLY
+        is_so = abs(after / before / self.factor - 1.0) < 0.1
         return Trial(request, changed) if is_so and changed != method else None
 
 
@@ -346,9 +333,6 @@ OVERRIDES: tuple[AbstractOverride, ...] = (
 )
 """What every method is crossed with, one at a time."""
 
-PRIOR = "prior of "
-"""How a request says that a prior is the user's own."""
-
 _CHOSEN: LRUCache[Scene | PolarBayesError] = LRUCache(2)
 """Choices take minutes, and every method asks. One that failed would fail again."""
 
@@ -356,8 +340,8 @@ _CHOSEN: LRUCache[Scene | PolarBayesError] = LRUCache(2)
 def _choose(request: Request, tolerance: float) -> Scene | PolarBayesError:
     """The scene that `polar_bayes.choose_effects` chooses, or why it cannot."""
     plain = simplify(request.scene, ())
-    own = [name.removeprefix(PRIOR) for name in request.swapped if name.startswith(PRIOR)]
-    priors = {name: request.priors[name] for name in own}
+    swapped = (name.rpartition("prior of ") for name in request.swapped)  # by the user
+    priors = {name: request.priors[name] for _, found, name in swapped if found}
     limits = tolerance, request.largest_view_zenith, request.seed
     key = cache_key(request.model, plain, priors, request.links, request.capture, *limits)
 

@@ -2,9 +2,8 @@
 
 import dataclasses
 import itertools
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -16,6 +15,7 @@ from polar_bayes.cli.options import (
     MATERIAL,
     SCENE,
     Command,
+    all_of,
     command,
     link_option,
     option,
@@ -25,12 +25,15 @@ from polar_bayes.cli.options import (
 )
 from polar_bayes.cli.printing import print_cautions, say
 
+if TYPE_CHECKING:
+    from polar_bayes.results import Capture
+
 out_capture = out_option(CAPTURE_FILE, "Capture to write.")
 name_option = option("--name", help="Name of the capture.")
 wavelength_option = option("--wavelength", type=float, help="Nanometers.")
 
 
-def _save(capture: Any, out: Path) -> None:
+def _save(capture: "Capture", out: Path) -> None:
     """Write a capture, and print its counts."""
     pb.save_capture(capture, out)
     counts = pb.capture.count(capture)
@@ -38,30 +41,23 @@ def _save(capture: Any, out: Path) -> None:
     click.echo(f"{out}: {', '.join([_layout(capture), *flagged])}")
 
 
-def _layout(capture: Any) -> str:
+def _layout(capture: "Capture") -> str:
     """Lengths of the axes of a capture: `12 views x 4 wavelengths`."""
-    words = {"view": "view", "wavelength": "wavelength", "material": "material", "patch": "patch"}
-    sizes = {word: capture.sizes[dim] for dim, word in words.items() if dim in capture.sizes}
-    plural = {"patch": "patches"}
-    found = [
-        f"{size} {word if size == 1 else plural.get(word, f'{word}s')}"
-        for word, size in sizes.items()
-    ]
+    plural = {"view": "s", "wavelength": "s", "material": "s", "patch": "es"}
+    sizes = {dim: capture.sizes[dim] for dim in plural if dim in capture.sizes}
+    found = [f"{size} {dim}{'' if size == 1 else plural[dim]}" for dim, size in sizes.items()]
     if "y" in capture.sizes:
         found.append(f"{capture.sizes['y']} x {capture.sizes['x']} pixels")
     return " x ".join(found)
 
 
-def _save_import(capture: Any, out: Path) -> None:
+def _save_import(capture: "Capture", out: Path) -> None:
     """Write a capture; print its counts, what was inferred and what is unlikely."""
     _save(capture, out)
     for sentence in pb.capture.inferred(capture) + pb.capture.stated(capture):
         say(sentence)
     indices = pb.capture.indices_by_eye(capture)
     print_cautions(pb.capture.cautions(capture) + pb.capture.index_sentences(indices))
-
-
-OF_PROTOCOL = ("views", "largest_view_zenith", "wavelengths")
 
 
 @command()
@@ -81,7 +77,8 @@ OF_PROTOCOL = ("views", "largest_view_zenith", "wavelengths")
 @seed_option
 def simulate(out: Path, **settings: Any) -> None:
     """Draw a capture of a known material, by the paper's protocol."""
-    protocol = {name: settings.pop(name) for name in OF_PROTOCOL}  # a scene file says what is used
+    names = "views", "largest_view_zenith", "wavelengths"  # a scene file says what is used
+    protocol = {name: settings.pop(name) for name in names}
     settings = read_scene_options(settings)
     _save(pb.simulate(protocol=pb.simulation.Protocol(**protocol), **settings), out)
 
@@ -164,14 +161,20 @@ def goniometer(out: Path, **settings: Any) -> None:
 @option("--saturation-level", type=float, help="Intensity of a full pixel.")
 @name_option
 @out_capture
-def table(table: Path, out: Path, columns: Any, constants: Any, **settings: Any) -> None:
+def table(
+    table: Path,
+    out: Path,
+    columns: tuple[tuple[str, str], ...],
+    constants: tuple[tuple[str, float], ...],
+    **settings: Any,
+) -> None:
     """Import a table with a line for each reading and its directions."""
     settings["columns"] = _mapping(columns, "--column")
     settings["constants"] = _mapping(constants, "--constant")
     _save_import(pb.from_table(table, **settings), out)
 
 
-def _mapping(pairs: tuple[tuple[str, Any], ...], flag: str) -> dict[str, Any]:
+def _mapping[T](pairs: tuple[tuple[str, T], ...], flag: str) -> dict[str, T]:
     """A mapping from an option that is given once for each variable."""
     names = [name for name, _ in pairs]
     if repeated := [name for name in names if names.count(name) > 1]:
@@ -179,7 +182,7 @@ def _mapping(pairs: tuple[tuple[str, Any], ...], flag: str) -> dict[str, Any]:
     return dict(pairs)
 
 
-IMAGE_OPTIONS = (
+image_options = all_of(
     option(
         "--sphere", "spheres", type=float, nargs=3, multiple=True, metavar="ROW COLUMN RADIUS",
         help="A sphere in the frame [pixels]; give it once for each.",
@@ -215,13 +218,7 @@ IMAGE_OPTIONS = (
     name_option,
     out_capture,
 )  # fmt: skip
-
-
-def image_options(function: Callable) -> Callable:
-    """The options that every import of camera frames has."""
-    for decorator in reversed(IMAGE_OPTIONS):
-        function = decorator(function)
-    return function
+"""The options that every import of camera frames has."""
 
 
 @import_.command(cls=Command)
@@ -247,11 +244,11 @@ def polarizer(frames: tuple[tuple[float, Path], ...], out: Path, **options: Any)
 @option("--bin", type=int, default=2, help="Pixels averaged, a side.")
 def mosaic(frame: Path, layout: tuple[float, ...], out: Path, **options: Any) -> None:
     """Import one raw frame of a polarization camera."""
-    rows = layout[:2], layout[2:]
-    _save_image(pb.from_mosaic(frame, layout=rows, **_image_arguments(options)), out)
+    options["layout"] = layout[:2], layout[2:]
+    _save_image(pb.from_mosaic(frame, **_image_arguments(options)), out)
 
 
-def _save_image(capture: Any, out: Path) -> None:
+def _save_image(capture: "Capture", out: Path) -> None:
     """Write a capture, and print how many readings are masked for which reason."""
     _save_import(capture, out)
     masked = ", ".join(
@@ -292,7 +289,7 @@ def _image_arguments(options: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _only_one(given: dict[str, Any]) -> Any:
+def _only_one[T](given: dict[str, T]) -> T:
     """The value of the one option that was given."""
     values = [value for value in given.values() if value]
     if len(values) != 1:

@@ -1,7 +1,7 @@
 """Commands that measure how far a fit can be trusted."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -24,6 +24,9 @@ from polar_bayes.cli.options import (
 from polar_bayes.cli.printing import NOT_CONVERGED, json_rows, print_frame, print_json, say
 from polar_bayes.methods.registry import FIT_DEFAULT, METHODS
 from polar_bayes.progress import stages
+
+if TYPE_CHECKING:
+    from polar_bayes.results import Result
 
 CALIBRATION_COLUMNS = (
     "answered, failed: fits with an answer, and without one",
@@ -64,8 +67,7 @@ def calibrate(
     """Simulate captures of this layout, fit each, and test the coverage of the intervals."""
     from polar_bayes.inference.result import provenance_of
 
-    data = pb.load_capture(capture)
-    settings = read_scene_options(settings)
+    data, settings = pb.load_capture(capture), read_scene_options(settings)
     store = out.with_name(f"{out.name}.fits")
     if resume and out.exists() and not store.exists():
         raise pb.FitError("nothing is left to resume", where=str(out), hint="give another --out")
@@ -119,8 +121,7 @@ def identify(
     **settings: Any,
 ) -> None:
     """Which parameters a capture determines, which trade off, and where to look next."""
-    data = pb.load_capture(capture)
-    settings = read_scene_options(settings)
+    data, settings = pb.load_capture(capture), read_scene_options(settings)
     with stages() as progress:
         settings["progress"] = progress
         results = {"parameters": pb.identify(data, **settings)}
@@ -132,7 +133,7 @@ def identify(
             results["next views"] = pb.next_views(data, count=count, criterion=goal, **settings)
     found = {name: (pb.summary(each), pb.verdict(each).sentences) for name, each in results.items()}
     if as_json:
-        rows: dict[str, Any] = {name: json_rows(table) for name, (table, _) in found.items()}
+        rows: dict[str, object] = {name: json_rows(table) for name, (table, _) in found.items()}
         for name, (_, sentences) in found.items():
             rows["sentences" if name == "parameters" else f"{name}: sentences"] = sentences
         print_json(rows)
@@ -166,14 +167,17 @@ def accuracy(
     **settings: Any,
 ) -> None:
     """What each method gets wrong for this capture, and what it costs in time."""
-    data = pb.load_capture(capture)
-    settings = read_scene_options(settings)
+    data, settings = pb.load_capture(capture), read_scene_options(settings)
     names = methods or tuple(pb.methods.STUDY_METHODS)
     settings["methods"] = {name: pb.methods.STUDY_METHODS[name] for name in names}
-    quick = {name: pb.methods.STUDY_METHODS[name] for name in QUICK if name in names}
+    quick = {
+        name: pb.methods.STUDY_METHODS[name]
+        for name in ("point", "laplace", "importance")
+        if name in names
+    }
     if quick and not as_json:
         click.echo("First answer, by a rough reference:\n")
-        rough = pb.benchmark.Reference(error=ROUGH, longer=0)
+        rough = pb.benchmark.Reference(error=0.06, longer=0)
         first = {"methods": quick, "overrides": (), "reference": rough, "fresh": False}
         study = pb.accuracy(data, **settings | first)
         pb.save(study, out)
@@ -182,7 +186,7 @@ def accuracy(
     if no_overrides:
         settings["overrides"] = ()
 
-    def keep(study: Any) -> None:
+    def keep(study: "Result") -> None:
         """Write the study so far, and tell its last row."""
         pb.save(study, out)
         name, row = list(pb.summary(study).iterrows())[-1]
@@ -200,12 +204,6 @@ def accuracy(
     next_step = f"Next: polar-bayes fit {capture} --method NAME --out fit.nc, by the method named."
     print_frame(table[SHOWN], [*ACCURACY_COLUMNS, "", advice, "", next_step])
 
-
-QUICK = ("point", "laplace", "importance")
-"""Methods of a first answer."""
-
-ROUGH = 0.06
-"""Error of the reference of a first answer, in posterior sds."""
 
 SHOWN = ["error", "worst", "k_hat", "r_hat", "seconds_first", "seconds_again"]
 ACCURACY_COLUMNS = (

@@ -27,7 +27,7 @@ import warnings
 from collections.abc import Callable
 from concurrent.futures import Future, wait
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import click
 
@@ -52,10 +52,6 @@ SIGNALS = tuple(
 POLL, CLEAN_UP, LEAVE = 0.1, 3.0, 0.5
 """Seconds: between two polls for a signal; for all cleanups; for threads that are still alive."""
 
-STACK = 16 * 2**20
-"""Bytes of the stack of the command's thread: by default macOS gives threads 0.5 MiB."""
-
-DAMAGED = "Error reading persistent compilation cache entry"
 FOLDER = "JAX_COMPILATION_CACHE_DIR"
 
 
@@ -95,7 +91,7 @@ def _start(context: contextvars.Context, command: Callable[[], int], outcome: Fu
         except BaseException as error:
             outcome.set_exception(error)
 
-    default_size = threading.stack_size(STACK)
+    default_size = threading.stack_size(16 * 2**20)  # by default macOS gives threads 0.5 MiB
     try:
         threading.Thread(target=work, name="polar-bayes command", daemon=True).start()
     finally:
@@ -142,10 +138,11 @@ def quiet_libraries() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA: slow compilation, other processors
     logging.getLogger().addHandler(logging.NullHandler())  # else Python writes them to stderr
     damaged: list[str] = []
+    start = "Error reading persistent compilation cache entry"
 
-    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+    def show(message: Warning | str, *_: object, **__: object) -> None:
         """Print one line about all damaged entries of the compilation cache, and nothing else."""
-        if str(message).startswith(DAMAGED) and not damaged:
+        if str(message).startswith(start) and not damaged:
             damaged.append(str(message))
             click.echo(
                 f"{os.environ.get(FOLDER, FOLDER)}: compiled programs there are damaged and are "
@@ -177,14 +174,10 @@ def keep_compiled_programs() -> None:
 # --- Memory ---------------------------------------------------------------------------------------
 
 
-M_ARENA_MAX = -8
-"""The number of this setting in the C library of GNU."""
-
-
 def limit_arenas() -> None:
     """Have threads share two pools of memory, so that a map takes as much whatever its size."""
     with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library
-        ctypes.CDLL(None).mallopt(M_ARENA_MAX, 2)
+        ctypes.CDLL(None).mallopt(-8, 2)  # M_ARENA_MAX of the C library of GNU
 
 
 # --- Running a command ----------------------------------------------------------------------------

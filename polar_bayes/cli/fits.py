@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -49,6 +49,9 @@ from polar_bayes.interrupts import on_interrupt
 from polar_bayes.methods.registry import FIT_DEFAULT, MAP_DEFAULT
 from polar_bayes.paths import write_errors
 from polar_bayes.progress import notice, stages
+
+if TYPE_CHECKING:
+    from polar_bayes.results import Result
 
 DEMO = "polar-bayes demo"
 """Attribute of the capture of a demo, by which the next demo recognizes its folder."""
@@ -134,7 +137,8 @@ def fit(
 
         progress = until_compared.enter_context(stages())
         if choose:
-            options = {key: settings[key] for key in OF_CHOICE}
+            matter = ("scene", "model", "priors", "links", "largest_view_zenith", "seed")
+            options = {key: settings[key] for key in matter}
             options |= {} if tolerance is None else {"tolerance": tolerance}
             chosen: Any = pb.choose_effects(data, progress=progress, **options)
             say("\n".join(pb.verdict(chosen.ledger).sentences), err=True)
@@ -157,10 +161,6 @@ def _kept(fit: Any, out: Path) -> str:
     """Write a fit that is not compared to the end; the sentence that says so."""
     pb.save(fit, out)
     return f"{out}: the fit is whole, and was not compared with other scenes to the end"
-
-
-OF_CHOICE = ("scene", "model", "priors", "links", "largest_view_zenith", "seed")
-"""Options of a fit that matter for the choice of its effects."""
 
 
 def _in_setup(chosen: Any, scene: Any) -> Any:
@@ -250,8 +250,7 @@ def regions(maps: Path, labels: Path, against: int | None, as_json: bool) -> Non
 @out_option(RESULT_FILE, "Ledger to write.", required=False)
 def effects(capture: Path, as_json: bool, out: Path | None, **settings: Any) -> None:
     """What each effect changes and costs; which of them this capture can see."""
-    data = pb.load_capture(capture)
-    settings = read_scene_options(settings)
+    data, settings = pb.load_capture(capture), read_scene_options(settings)
     with stages() as progress:
         ledger: Any = pb.choose_effects(data, progress=progress, **settings).ledger
     if out is not None:
@@ -290,8 +289,7 @@ def scene(source: Path | str, out: Path | None) -> None:
 @json_option
 def scenes(capture: Path, out: Path | None, as_json: bool, **settings: Any) -> int | None:
     """Compare scenes, from simple to complex; with --out, fit those that remain."""
-    data = pb.load_capture(capture)
-    settings = read_scene_options(settings)
+    data, settings = pb.load_capture(capture), read_scene_options(settings)
     method = settings.pop("method")
     found: Any
     with stages() as progress:
@@ -343,12 +341,12 @@ def report(
     click.echo(f"report: {page}")
 
 
-def _is_new_fit(result: Any) -> bool:
+def _is_new_fit(result: "Result") -> bool:
     """Whether it is a fit of which nobody has asked yet what to measure next."""
     return "posterior" in result and "next_views" not in result and pb.verdict(result).passed
 
 
-def _add_next_views(result: Any) -> None:
+def _add_next_views(result: "Result") -> None:
     """Keep with a fit which views to take next; where that is not known, say why."""
     try:
         with stages() as progress:

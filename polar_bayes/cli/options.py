@@ -17,6 +17,14 @@ from polar_bayes.errors import CaptureError, FitError, OutputError, PolarBayesEr
 from polar_bayes.methods.registry import method_names
 from polar_bayes.paths import as_path, check_output, is_scene_file, refuse_inputs
 
+type Param = click.Parameter | None
+type Context = click.Context | None
+
+
+def _flag(param: Param) -> str:
+    """An option or argument as errors name it."""
+    return param.opts[0] if param is not None else "value"
+
 
 class Name(click.ParamType):
     """A key of a registry of the package, which is not imported for this check."""
@@ -27,13 +35,10 @@ class Name(click.ParamType):
         self.kind, self.names, self.error = kind, names, error
 
     @override
-    def convert(self, value: Any, param: Any, ctx: Any) -> str:
+    def convert(self, value: str | Path, param: Param, ctx: Context) -> str:
         if value not in self.names:
-            raise self.error(
-                f"no such {self.kind}",
-                where=f"{param.opts[0]} {value}",
-                hint=f"give one of {', '.join(self.names)}",
-            )
+            where, hint = f"{_flag(param)} {value}", f"give one of {', '.join(self.names)}"
+            raise self.error(f"no such {self.kind}", where=where, hint=hint)
         return str(value)
 
 
@@ -41,7 +46,7 @@ class Settings(Name):
     """The same, or settings such as `Nuts(draws=2000)`, which are parsed when they are needed."""
 
     @override
-    def convert(self, value: Any, param: Any, ctx: Any) -> str:
+    def convert(self, value: str | Path, param: Param, ctx: Context) -> str:
         return str(value) if "(" in str(value) else super().convert(value, param, ctx)
 
 
@@ -54,14 +59,14 @@ class Assignment(click.ParamType):
         self.is_named = is_named
 
     @override
-    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[str, str]:
+    def convert(self, value: str | Path, param: Param, ctx: Context) -> tuple[str, str]:
         name, equals, text = str(value).partition("=")
         if equals and name.strip().isidentifier():
             return name.strip(), text
         if self.is_named:
             what = "it does not say of what"
             hint = "write NAME=DISTRIBUTION, such as 'angle_zero=Normal(0,3)'"
-            raise FitError(what, where=f"{param.opts[0]} {value}", hint=hint)
+            raise FitError(what, where=f"{_flag(param)} {value}", hint=hint)
         return "", str(value)
 
 
@@ -82,8 +87,8 @@ class Input(click.ParamType):
         self.is_path = is_path
 
     @override
-    def convert(self, value: Any, param: Any, ctx: Any) -> Path | str:
-        return as_path(value, param.opts[0]) if self.is_path else str(value)
+    def convert(self, value: str | Path, param: Param, ctx: Context) -> Path | str:
+        return as_path(value, _flag(param)) if self.is_path else str(value)
 
     def check(self, path: Path) -> None:
         """Refuse a path that does not exist, unless it may be the name of a column."""
@@ -100,14 +105,14 @@ class NamedInput(Input):
         self.names, self.suffix, self.otherwise = names, suffix, otherwise
 
     @override
-    def convert(self, value: Any, param: Any, ctx: Any) -> Path | str:
+    def convert(self, value: str | Path, param: Param, ctx: Context) -> Path | str:
         if value in self.names:
             return str(value)
-        path = as_path(value, param.opts[0])
+        path = as_path(value, _flag(param))
         if path.suffix == self.suffix or path.exists():
             return path
         hint = f"give one of {', '.join(self.names)}, or {self.otherwise}"
-        raise SceneError("no such scene", where=f"{param.opts[0]} {value}", hint=hint)
+        raise SceneError("no such scene", where=f"{_flag(param)} {value}", hint=hint)
 
 
 class Output(click.ParamType):
@@ -121,8 +126,8 @@ class Output(click.ParamType):
         self.kind = kind
 
     @override
-    def convert(self, value: Any, param: Any, ctx: Any) -> Path:
-        return as_path(value, param.opts[0], OutputError)
+    def convert(self, value: str | Path, param: Param, ctx: Context) -> Path:
+        return as_path(value, _flag(param), OutputError)
 
     def check(self, path: Path, inputs: list[Path]) -> None:
         """Refuse a path that must not be written."""
@@ -148,7 +153,7 @@ class Command(click.Command):
     """A command whose inputs and outputs are checked before it begins."""
 
     @override
-    def invoke(self, ctx: click.Context) -> Any:
+    def invoke(self, ctx: click.Context) -> object:
         inputs = []
         for param in self.params:
             kinds = param.type.types if isinstance(param.type, click.Tuple) else [param.type]
@@ -163,7 +168,7 @@ class Command(click.Command):
         return super().invoke(ctx)
 
 
-def _paths(value: Any, kind: Input) -> Iterator[Path]:
+def _paths(value: object, kind: Input) -> Iterator[Path]:
     """Every path in the value of an option that may be given several times."""
     if isinstance(value, Path) or (isinstance(value, str) and not isinstance(kind, NamedInput)):
         yield Path(value)
@@ -193,9 +198,15 @@ view_limit_option = option(
 )
 
 
-def scene_options(function: Callable) -> Callable:
-    """The options of every command that fits a scene."""
-    return scene_option(prior_option(link_option(view_limit_option(function))))
+def all_of(*options: Callable) -> Callable:
+    """Several options as one decorator."""
+    return lambda function: functools.reduce(
+        lambda inner, each: each(inner), options[::-1], function
+    )
+
+
+scene_options = all_of(scene_option, prior_option, link_option, view_limit_option)
+"""The options of every command that fits a scene."""
 
 
 NUTS_OPTIONS = {
@@ -206,12 +217,13 @@ NUTS_OPTIONS = {
 }
 
 
-def nuts_options(function: Callable) -> Callable:
-    """What messages recommend where chains have not converged."""
-    for name, (kind, words) in reversed(NUTS_OPTIONS.items()):
-        flag = f"--{name.replace('_', '-')}"
-        function = option(flag, type=kind, help=f"{words} Of --method nuts.")(function)
-    return function
+nuts_options = all_of(
+    *(
+        option(f"--{name.replace('_', '-')}", type=kind, help=f"{words} Of --method nuts.")
+        for name, (kind, words) in NUTS_OPTIONS.items()
+    )
+)
+"""What messages recommend where chains have not converged."""
 
 
 def with_nuts_options(settings: dict[str, Any]) -> dict[str, Any]:

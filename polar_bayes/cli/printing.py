@@ -3,13 +3,17 @@
 import json
 import sys
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Literal
 
 import click
 
 import polar_bayes as pb
 from polar_bayes.cli.wording import as_commands
 from polar_bayes.repr_html import Row, Table
+
+if TYPE_CHECKING:  # a command that needs no numbers loads no library of numbers
+    from polar_bayes.frames import Frame
+    from polar_bayes.results import Fit, Result
 
 NOT_CONVERGED = 2
 """Exit status of a fit whose diagnostics fail."""
@@ -33,12 +37,12 @@ def _in_commands(value: object) -> object:
     return as_commands(value) if isinstance(value, str) else value
 
 
-def json_rows(table: Any, orient: str = "index") -> Any:
+def json_rows(table: "Frame", orient: Literal["index", "records"] = "index") -> object:
     """The rows of a data frame by label, or in a list (`"records"`), as JSON has them."""
     return json.loads(table.to_json(orient=orient))
 
 
-def print_frame(frame: Any, sentences: Iterable[str] = ()) -> None:
+def print_frame(frame: "Frame", sentences: Iterable[str] = ()) -> None:
     """Print a data frame, numbers with four digits and missing ones as -, and sentences below."""
     rows = (Row(str(label), tuple(map(_text, cells))) for label, *cells in frame.itertuples())
     click.echo(Table(("", *frame.columns), tuple(rows)).to_text(sys.stdout))
@@ -46,7 +50,7 @@ def print_frame(frame: Any, sentences: Iterable[str] = ()) -> None:
         say("\n".join(["", *sentences]))
 
 
-def _text(cell: Any) -> str:
+def _text(cell: object) -> str:
     if cell is None or cell != cell:  # NaN
         return "-"
     if not isinstance(cell, float):
@@ -57,7 +61,7 @@ def _text(cell: Any) -> str:
 # --- Fits -----------------------------------------------------------------------------------------
 
 
-def print_verdict(result: Any) -> int:
+def print_verdict(result: "Result") -> int:
     """Print what speaks against a fit, or what was checked, on the error stream; exit status."""
     verdict = pb.verdict(result)
     for problem in verdict.problems:
@@ -70,27 +74,22 @@ def print_verdict(result: Any) -> int:
     return 0 if verdict.passed else NOT_CONVERGED
 
 
-def print_fit(result: Any, *, as_json: bool = False) -> int:
+def print_fit(result: "Fit", *, as_json: bool = False) -> int:
     """Print a row per parameter, and the verdict as `print_verdict` does."""
     if as_json:
         print_json(pb.diagnostics.json_summary(result))
     else:
-        _print_parameters(result)
+        columns = ["mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk"]
+        titles = ["mean", "sd", "2.5%", "97.5%", "R-hat", "ESS"]
+        print_frame(pb.summary(result)[columns].set_axis(titles, axis="columns"))
+        if words := list(_explanations(result)):
+            click.echo("\n".join(["", *words]))
     return print_verdict(result)
 
 
-def _print_parameters(result: Any) -> None:
-    """A row per parameter, and what those mean whose names do not say it."""
-    columns = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk")
-    titles = ["mean", "sd", "2.5%", "97.5%", "R-hat", "ESS"]
-    print_frame(pb.summary(result)[[*columns]].set_axis(titles, axis="columns"))
-    if words := list(_explanations(result["posterior"].dataset)):
-        click.echo("\n".join(["", *words]))
-
-
-def _explanations(posterior: Any) -> Iterator[str]:
+def _explanations(result: "Fit") -> Iterator[str]:
     """What parameters mean whose names do not say it, with their units."""
-    for name, variable in posterior.data_vars.items():
+    for name, variable in result["posterior"].data_vars.items():
         meaning, unit = (variable.attrs.get(key, "") for key in ("long_name", "units"))
         if meaning and not meaning.startswith(str(name).replace("_", " ")):
             yield f"{name}: {meaning}{'' if unit == '1' else f' [{unit}]'}"

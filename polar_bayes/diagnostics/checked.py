@@ -17,8 +17,6 @@ NAMES = {
     "alternatives": "alternative parts of the scene",
 }
 """Checks of the criticism whose own names do not say what they look at."""
-NEVER_AGAINST = ("absent",)
-"""Checks that describe, and say nothing against the intervals."""
 TESTED = (
     *("noise", "systematic errors", "angle", "wavelength", "outliers", "leave-one-out"),
     "alternatives",
@@ -39,7 +37,8 @@ def checks_made(method: str, criticism: pd.DataFrame) -> tuple[tuple[str, ...], 
     elif method in WEIGHTED:
         how = "weighted draws (effective sample size, Pareto k-hat)"
     made, missing = [how], []
-    for check, row in criticism.drop(index=[*NEVER_AGAINST], errors="ignore").iterrows():
+    # What is absent only describes, and says nothing against the intervals.
+    for check, row in criticism.drop(index=["absent"], errors="ignore").iterrows():
         name = NAMES.get(str(check), str(check))
         if row["level"] == "not computed":
             missing.append(name)

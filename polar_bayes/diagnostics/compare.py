@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Mapping
-from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
@@ -20,11 +19,6 @@ from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.result import CENTRAL_95
 from polar_bayes.numerics.psis import MAX_PARETO_K
 from polar_bayes.observation.data import ANGLES
-
-SUMMARY_COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk")
-SENSITIVITY_COLUMNS = (
-    *("prior_inside", "verdict", "prior_sensitivity", "likelihood_sensitivity", "remark"),
-)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -86,10 +80,9 @@ def compare_fits(fits: Mapping[str, xr.DataTree]) -> FitComparison:
 
 def _parameters(fits: Mapping[str, FitView]) -> pd.DataFrame:
     """The columns of both tables of each fit, parameter by parameter."""
-    found = {
-        name: summary(fit)[[*SUMMARY_COLUMNS]].join(sensitivity(fit)[[*SENSITIVITY_COLUMNS]])
-        for name, fit in fits.items()
-    }
+    own = ["mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk"]
+    prior = ["prior_inside", "verdict", "prior_sensitivity", "likelihood_sensitivity", "remark"]
+    found = {name: summary(fit)[own].join(sensitivity(fit)[prior]) for name, fit in fits.items()}
     labels = dict.fromkeys(label for table in found.values() for label in table.index)
     rows = [(label, name) for label in labels for name in fits if label in found[name].index]
     return pd.concat(found, names=["fit", "parameter"]).swaplevel().loc[rows]
@@ -164,12 +157,6 @@ def _combined(parts: list[Loo]) -> ELPDDataLOO:
 
 # --- The fitted readings on a single axis ---------------------------------------------------------
 
-READING_GROUPS = (
-    *("observed_data", "log_likelihood", "posterior_predictive", "noise_free", "prior_predictive"),
-)
-FITTED = MappingProxyType({"valid": True})
-"""Flags of readings that were fitted."""
-
 
 def stack_readings(result: xr.DataTree) -> xr.DataTree:
     """The same result with a single axis of readings: only those that the fit has used.
@@ -198,11 +185,14 @@ def stack_readings(result: xr.DataTree) -> xr.DataTree:
     check_fit(result)
     observed = result["observed_data"].to_dataset()
     stacked = result.copy()
-    for group in READING_GROUPS:
+    predicted = ("log_likelihood", "posterior_predictive", "noise_free", "prior_predictive")
+    for group in ("observed_data", *predicted):
         if group in result.children:
             variables = result[group].to_dataset()
             rows = {
-                name: _stack(variables[name], reading, usable_readings(result, str(name), FITTED))
+                name: _stack(
+                    variables[name], reading, usable_readings(result, str(name), {"valid": True})
+                )
                 for name, reading in observed.items()
                 if name in variables
             }
@@ -218,8 +208,6 @@ def _stack(variable: xr.DataArray, reading: xr.DataArray, fitted: np.ndarray) ->
 
 
 # --- Intervals without a part of the instrument ---------------------------------------------------
-
-COLUMNS = ("mean", "q2.5", "q97.5", "mean_without", "q2.5_without", "q97.5_without", "width_ratio")
 
 WITHOUT = {"discrepancy": "the discrepancy term", "instrument": "any instrument term"}
 """Fits for comparison, in the groups `without_<key>` of a result: the terms that they omit."""
@@ -238,5 +226,7 @@ def compare_without(result: xr.DataTree | FitView, part: str) -> pd.DataFrame:
         own, its = ([draws.mean(), *np.quantile(draws, CENTRAL_95)] for draws in both)
         width = own[2] - own[1]
         rows[scalar.label] = (*own, *its, (its[2] - its[1]) / width if width > 0.0 else np.nan)
+    columns = ["mean", "q2.5", "q97.5"]
+    columns += [*(f"{name}_without" for name in columns), "width_ratio"]
     index = pd.Index(list(rows), dtype=str)
-    return pd.DataFrame(list(rows.values()), columns=list(COLUMNS), index=index)
+    return pd.DataFrame(list(rows.values()), columns=columns, index=index)

@@ -6,7 +6,7 @@ Source: Vehtari et al. (2021), Bayesian Analysis 16(2) (R-hat, ESS); Vehtari et 
 
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,40 +16,21 @@ from arviz_stats.base import array_stats
 
 from polar_bayes.diagnostics.checked import checks_made
 from polar_bayes.diagnostics.criticism import criticize
-from polar_bayes.diagnostics.finding import listed
+from polar_bayes.diagnostics.finding import join, listed
+from polar_bayes.diagnostics.limits import LIMITS
 from polar_bayes.diagnostics.parameters import (
     APPROXIMATIONS,
     WEIGHTED,
     Scalar,
     with_entries,
 )
-from polar_bayes.diagnostics.view import FitView, once, view_of
+from polar_bayes.diagnostics.view import FitView, Provenance, once, view_of
 from polar_bayes.inference.result import CENTRAL_95, bounds_of
 from polar_bayes.numerics.mcse import LARGEST_R_HAT, SMALLEST_ESS, TAILS
 from polar_bayes.numerics.psis import MAX_PARETO_K, smooth
 from polar_bayes.priors import RANGES
 
 COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk", "ess_tail", "mcse_mean")
-LARGE_CORRECTION = 0.1
-"""Error of an approximate mean in sds, or of an sd in its log, that is told."""
-MAX_SECOND_MODE = 0.01
-TAIL_ERRORS = 3.5
-"""Standard errors by which the share in a tail must exceed that of chains: of twenty tails of two
-right methods one does so in 0.5% of the fits."""
-MAX_MASKED = 0.25
-MAX_AT_MARGIN = 0.25
-MAX_DEEP_TREES = 0.01
-ROUNDING = 1e-6
-"""Tolerance of draws in single precision at the ends of their prior."""
-ONLY_HEAVIEST = ", and only the heaviest is described here; use method='nuts', or "
-OTHER_MODES = {
-    "laplace": ONLY_HEAVIEST,
-    "variational": ONLY_HEAVIEST,
-    "importance": ", and the draws are of both; a mean may lie between them; ",
-    "nuts": ", and chains may not have visited them in proportion; compare chains in the rank "
-    "plot, or ",
-}
-"""The effect of a further mode on the results of each method."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,9 +66,8 @@ class Verdict:
         """What was checked, of a fit without problem and caution; empty of any other."""
         if not self.passed or self.cautions or not self.checked:
             return ""
-        first, last = ", ".join(self.checked[:-1]), self.checked[-1]
         left = f" Not computed: {', '.join(self.not_checked)}." if self.not_checked else ""
-        made = f"{first} and {last}" if first else last
+        made = join(self.checked)
         return f"Nothing speaks against the intervals in what was checked: {made}.{left}"
 
 
@@ -261,12 +241,12 @@ def _draw_problems(fit: FitView) -> Iterator[str]:
         )
 
 
-def _out_of_range(scalar: Scalar, provenance: Mapping[str, Any]) -> tuple[str, np.ndarray]:
+def _out_of_range(scalar: Scalar, provenance: Provenance) -> tuple[str, np.ndarray]:
     """Finite draws outside the prior, or outside the physical range of the parameter."""
     least, most = RANGES.get(scalar.name, (-math.inf, math.inf))
     low, high = bounds_of(provenance, scalar.name)
     ends = np.array([max(low, least), min(high, most)])
-    low, high = ends + np.array([-ROUNDING, ROUNDING]) * np.maximum(1.0, abs(ends))
+    low, high = ends + np.array([-LIMITS.rounding, LIMITS.rounding]) * np.maximum(1.0, abs(ends))
     outside = (scalar.draws < low) | (scalar.draws > high)
     label = f"{scalar.label} [{ends[0]:g}, {ends[1]:g}]"
     return label, outside & np.isfinite(scalar.draws)
@@ -345,7 +325,7 @@ def _corrections(weights: np.ndarray, found: Sequence[Scalar]) -> Iterator[str]:
         mean = weights @ draws
         sd = math.sqrt(weights @ (draws - mean) ** 2)
         shift, ratio = abs(mean - draws.mean()) / sd, draws.std() / sd
-        if shift > LARGE_CORRECTION or abs(math.log(ratio)) > LARGE_CORRECTION:
+        if shift > LIMITS.large_correction or abs(math.log(ratio)) > LIMITS.large_correction:
             text = f"{scalar.label} (mean by {shift:.1f} sd, sd {ratio - 1.0:+.0%})"
             changes.append((shift + abs(math.log(ratio)), text))
     if changes:
@@ -356,12 +336,20 @@ def _corrections(weights: np.ndarray, found: Sequence[Scalar]) -> Iterator[str]:
         )
 
 
-def _mode_cautions(provenance: Mapping[str, Any]) -> Iterator[str]:
+def _mode_cautions(provenance: Provenance) -> Iterator[str]:
     weights = (provenance.get("modes") or {}).get("weights", [])
     # Weighted draws of all modes have told whether chains have their tails.
     compared = (provenance.get("tails") or {}).get("k_hat", math.inf) <= MAX_PARETO_K
-    if len(weights) > 1 and weights[1] > MAX_SECOND_MODE and not compared:
-        effect = OTHER_MODES.get(str(provenance.get("method", "laplace")), "; ")
+    if len(weights) > 1 and weights[1] > LIMITS.second_mode and not compared:
+        heaviest = ", and only the heaviest is described here; use method='nuts', or "
+        effects = {
+            "laplace": heaviest,
+            "variational": heaviest,
+            "importance": ", and the draws are of both; a mean may lie between them; ",
+            "nuts": ", and chains may not have visited them in proportion; compare chains in the "
+            "rank plot, or ",
+        }
+        effect = effects.get(str(provenance.get("method", "laplace")), "; ")
         yield (
             f"The posterior has another mode, of weight {weights[1]:.2g}: another explanation of "
             f"the readings exists{effect}add views that tell them apart."
@@ -379,7 +367,7 @@ def _tail_cautions(fit: FitView) -> Iterator[str]:
         row = summary(fit).loc[scalar.label]
         error = math.sqrt(variance / row["ess_tail"] + variance / tails["effective_draws"])
         for share, side, end in zip(shares, ("below", "above"), ("q2.5", "q97.5"), strict=True):
-            if share > max(2.0 * nominal, nominal + TAIL_ERRORS * error):
+            if share > max(2.0 * nominal, nominal + LIMITS.tail_errors * error):
                 missed.append((share, f"{scalar.label} {side} {row[end]:.3g} ({share:.1%})"))
     if missed:
         names = listed(text for _, text in sorted(missed, reverse=True))
@@ -393,7 +381,7 @@ def _tail_cautions(fit: FitView) -> Iterator[str]:
 def _chain_notes(fit: FitView) -> Iterator[str]:
     """Trajectories that were cut short, which costs time and biases nothing."""
     deep = fit.stats.get("reached_max_treedepth")
-    if deep is not None and deep.sum() > MAX_DEEP_TREES * deep.size:
+    if deep is not None and deep.sum() > LIMITS.deep_trees * deep.size:
         yield (
             f"{int(deep.sum())} of {deep.size} draws reached the largest tree depth: steps were "
             "cut short, which biases nothing but makes draws alike; raise it, as in "
@@ -411,33 +399,33 @@ def _estimate_cautions(fit: FitView) -> Iterator[str]:
         )
 
 
-def _reading_cautions(counts: Mapping[str, Any]) -> Iterator[str]:
+def _reading_cautions(counts: Provenance) -> Iterator[str]:
     total, masked = counts.get("views") or 0, counts.get("masked") or 0
-    if total and masked / total > MAX_MASKED:
+    if total and masked / total > LIMITS.masked:
         yield (
             f"{masked} of {total} readings are marked valid=False: the rest may not be a fair "
             "sample of the angles."
         )
     for name, count in (counts.get("at_margin") or {}).items():
-        if total and count / total > MAX_AT_MARGIN:
+        if total and count / total > LIMITS.at_margin:
             yield (
                 f"{count} readings of {name} lie at the edge of their range and were moved to "
                 "the link's margin: their noise is not what the link describes."
             )
 
 
-def _reading_notes(counts: Mapping[str, Any]) -> Iterator[str]:
+def _reading_notes(counts: Provenance) -> Iterator[str]:
     """Readings at the edge of their range, as a mirror has near Brewster's angle, where few."""
     total = counts.get("views") or 0
     for name, count in (counts.get("at_margin") or {}).items():
-        if count and total and count / total <= MAX_AT_MARGIN:
+        if count and total and count / total <= LIMITS.at_margin:
             yield (
                 f"{count} of {total} readings of {name} lie at the edge of their range and were "
                 "moved to the link's margin."
             )
 
 
-def setup_cautions(provenance: Mapping[str, Any]) -> tuple[str, ...]:
+def setup_cautions(provenance: Provenance) -> tuple[str, ...]:
     """A caution where nobody stated the set-up of a capture, whatever was made of it."""
     if provenance.get("scene_chosen_by") != "default":
         return ()

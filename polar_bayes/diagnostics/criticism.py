@@ -10,10 +10,8 @@ Stat. Assoc. 90, 773 (Bayes factors of alternative parts); Vovk & Wang (2021), A
 1736 (their mean as a p-value).
 """
 
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -23,11 +21,12 @@ from scipy.special import logsumexp
 
 from polar_bayes.capture.plausibility import IndexByEye, index_sentences
 from polar_bayes.diagnostics.alternatives import alternatives
-from polar_bayes.diagnostics.finding import Finding, judged_by, listed, p_text
+from polar_bayes.diagnostics.finding import Finding, join, judged_by, listed, p_text
+from polar_bayes.diagnostics.limits import LIMITS
 from polar_bayes.diagnostics.parameters import Scalar, with_entries
 from polar_bayes.diagnostics.predictive import PredictiveCheck, predictive_checks
 from polar_bayes.diagnostics.residuals import residual_findings, residuals_of
-from polar_bayes.diagnostics.view import FitView, once, view_of
+from polar_bayes.diagnostics.view import FitView, Provenance, once, view_of
 from polar_bayes.errors import FitError
 from polar_bayes.inference.checks import (
     CARRIES,
@@ -44,31 +43,12 @@ from polar_bayes.observation.data import ANGLES
 from polar_bayes.observation.links import PERFECT
 from polar_bayes.physics.part import absence
 
-FAR = 0.01
-"""Prior probability beyond the posterior median of one parameter that is told."""
-SMALL_FACTOR = 1.0 / 3.0
-"""Stated errors that the scatter does not reach by this factor, with probability 97.5%."""
-LARGE_DIFFERENCE = 1.5
-"""Difference of a posterior mean without the discrepancy that counts, in posterior sds."""
-SAME = 0.5
-"""Difference of a posterior mean without what is absent up to which it is the same, in sds."""
-FAVORED = math.log(3.0)
-"""Log Bayes factor up to which evidence is worth no more than a bare mention (Kass and Raftery)."""
-REFUTED = -math.log(20.0)
-"""Log Bayes factor below which the readings speak strongly against an alternative."""
-OUTSIDE = 1.96
-"""Shift by an alternative, in posterior sds, that leaves the 95% interval."""
-NEAR_ZERO = 0.1
-"""Prior probability of the amplitudes of smooth errors that count as zero."""
 INDEX = "refractive_index"
 INDEX_PARAMETERS = (
     *(INDEX, "cauchy_a", "refractive_index_level"),
     *("refractive_index_location", "refractive_index_level_location"),
 )
 """Parameters whose prior bounds the index of a material."""
-WITHOUT = "without_discrepancy"
-GROUPS = ("prior", "observed_data", "constant_data")
-"""Groups of a result without which nothing can be checked."""
 QUESTIONS = {
     "priors": "are the material and what carries it in the tails of their priors?",
     "absent": "is a part of the scene, or a fault of the instrument, not seen at all?",
@@ -85,14 +65,10 @@ QUESTIONS = {
     "alternatives": "would another part do as well, or better?",
 }
 """The checks in the order of the table, and what each asks."""
-CHECKS = tuple(QUESTIONS)
-COLUMNS = ("level", "p_value", "statistic", "sentence")
 
 
 @once
-def criticize(
-    result: xr.DataTree | FitView, checks: Mapping[str, PredictiveCheck] | None = None
-) -> pd.DataFrame:
+def criticize(result: xr.DataTree | FitView) -> pd.DataFrame:
     """What the readings say against the model of a fit.
 
     A check with a p-value gives a caution below 0.02 and a problem below 0.004, which is the
@@ -100,7 +76,6 @@ def criticize(
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
-        checks: Those of `predictive_checks(result)`, where they are there already.
 
     Returns:
         A row for each check of `QUESTIONS`. Columns: level ("passed", "note", "caution", "problem"
@@ -115,15 +90,15 @@ def criticize(
         Analysis 1, 893.
     """
     fit = view_of(result)
-    missing = [f"group {name}" for name in GROUPS if name not in fit.result.children]
+    needed = ("prior", "observed_data", "constant_data")
+    missing = [f"group {name}" for name in needed if name not in fit.result.children]
     if not missing:
         missing = [name for name in ANGLES if name not in fit.result["constant_data"].data_vars]
     if fit.method == "point" or missing:
         why = f"The result has no {', '.join(missing)}, so the model was not checked."
         if fit.method == "point":
             why = "A point fit has no draws to criticize."
-        return _table(dict.fromkeys(CHECKS, Finding("not computed", sentence=why)))
-    checks = predictive_checks(fit) if checks is None else checks
+        return _table(dict.fromkeys(QUESTIONS, Finding("not computed", sentence=why)))
     absent = [s for s in fit.scalars if _is_absent(s, fit)]
     index = _index(fit)
     # Where the index by eye says so, a wider prior is the remedy, and no other check names one.
@@ -137,7 +112,7 @@ def criticize(
             "index": index,
             "systematic errors": _systematic_errors(fit, absent),
             **residual_findings(residuals_of(fit)),
-            "leave-one-out": _leave_one_out(checks),
+            "leave-one-out": _leave_one_out(predictive_checks(fit)),
             "repeats": _repeats(fit),
             "alternatives": _alternatives(fit, absent),
         }
@@ -145,8 +120,8 @@ def criticize(
 
 
 def _table(findings: Mapping[str, Finding]) -> pd.DataFrame:
-    rows = [dataclasses.astuple(findings[name]) for name in CHECKS]
-    return pd.DataFrame(rows, columns=list(COLUMNS), index=pd.Index(CHECKS, name="check"))
+    rows = [findings[name] for name in QUESTIONS]
+    return pd.DataFrame(rows, index=pd.Index(list(QUESTIONS), name="check"))
 
 
 # --- Priors, noise and bounds ---------------------------------------------------------------------
@@ -173,7 +148,7 @@ def _prior_conflict(fit: FitView, is_beyond: bool) -> Finding:
         f"Priors and data are in conflict ({p_text(p_value)}): {listed(far)} from the center of "
         f"the prior; {advice}."
     )
-    least = "caution" if tails.min() < FAR else "passed"
+    least = "caution" if tails.min() < LIMITS.prior_tail else "passed"
     return judged_by(p_value, float(score.max()), sentence, least=least)
 
 
@@ -192,7 +167,7 @@ def _carriers(found: Sequence[Scalar]) -> list[Scalar]:
     return [s for s in judged if s.is_material or s.label in carrying]
 
 
-def _absent_end(name: str, provenance: Mapping[str, Any]) -> float:
+def _absent_end(name: str, provenance: Provenance) -> float:
     """-1 or 1 where the low or the high end of the support is where its part is absent, else 0."""
     absent = absence(name)
     if absent is None:
@@ -219,13 +194,13 @@ def _absent(found: Sequence[Scalar], absent: Sequence[Scalar]) -> Finding:
     words = list(dict.fromkeys(a.words for s in absent if (a := absence(s.name)) is not None))
     if not words:
         return Finding("passed")
-    shown = f"The readings show {' and '.join(filter(None, [', '.join(words[:-1]), words[-1]]))}"
+    shown = f"The readings show {join(words)}"
     if not others:
         return Finding("note", sentence=f"{shown}.")
     shifts = {s.label: _without(s, absent) for s in others}
     label = max(shifts, key=lambda name: abs(shifts[name]))
     change = f"{label} is the same without (within {max(abs(shifts[label]), 0.1):.1f} sd)"
-    if abs(shifts[label]) > SAME:
+    if abs(shifts[label]) > LIMITS.same_mean:
         draws = next(s.draws for s in others if s.label == label)
         value = draws.mean() + shifts[label] * draws.std()
         change = f"without, {label} would be {value:.4g} instead of {draws.mean():.4g}"
@@ -282,7 +257,7 @@ def _noise(fit: FitView) -> Finding:
                 f"The readings scatter {factor}: the errors are stated too small, or the scene "
                 "lacks what the readings show; check the errors, or try polar_bayes.compare_scenes."
             )
-        elif high < SMALL_FACTOR:
+        elif high < LIMITS.small_noise_factor:
             least = "note"
             sentence = (
                 f"The readings scatter {factor}: the errors are stated too large, and the fit "
@@ -362,13 +337,13 @@ def _systematic_errors(fit: FitView, absent: Sequence[Scalar]) -> Finding:
         return Finding("passed")
     if "scenes" in groups:  # those without smooth errors are among the scenes compared
         return Finding("passed")
-    if WITHOUT not in groups:
+    if "without_discrepancy" not in groups:
         reason = "Nothing is known of the answer without smooth errors, which was not fitted."
         return Finding("not computed", sentence=reason)
     sizes = [*amplitude, *(s for s in found if s.name == NOISE_FACTOR)]
     below = _prior_probability(fit, sizes)
     p_value = float(prior_conflict(np.array(list(below.values())), -np.ones(len(below))))
-    without = {label: s.draws for label, s in fit.scalars_of(WITHOUT).items()}
+    without = {label: s.draws for label, s in fit.scalars_of("without_discrepancy").items()}
     shifts = {
         s.label: float((without[s.label].mean() - s.draws.mean()) / s.draws.std())
         for s in found
@@ -377,7 +352,7 @@ def _systematic_errors(fit: FitView, absent: Sequence[Scalar]) -> Finding:
     label = max(shifts, key=lambda name: abs(shifts[name]), default="")
     shift = abs(shifts.get(label, 0.0))
     how = f"amplitude {np.median(amplitude[0].draws):.2g}"
-    if shift > LARGE_DIFFERENCE and not _is_needed(fit, amplitude[0]):
+    if shift > LIMITS.large_difference and not _is_needed(fit, amplitude[0]):
         sentence = (
             f"The answer rests on smooth errors that the readings do not show for certain ({how}): "
             f"without them {label} would be {without[label].mean():.4g}, {shift:.1f} sd away; "
@@ -399,8 +374,8 @@ def _is_needed(fit: FitView, amplitude: Scalar) -> bool:
     prior = fit.prior.get(amplitude.label)
     if prior is None:
         return True
-    near = np.quantile(prior.draws, NEAR_ZERO)
-    return float(np.mean(amplitude.draws < near)) < math.exp(REFUTED) * NEAR_ZERO
+    near = np.quantile(prior.draws, LIMITS.near_zero)
+    return float(np.mean(amplitude.draws < near)) < math.exp(LIMITS.refuted) * LIMITS.near_zero
 
 
 # --- Leave-one-out and repeats --------------------------------------------------------------------
@@ -474,7 +449,7 @@ def _alternatives(fit: FitView, absent: Sequence[Scalar]) -> Finding:
         return Finding("passed")
     # What is not there has no size to rest on a part.
     own = ~table["redefined"] & ~table.index.isin([s.label for s in absent])
-    table = _without_idle(table.assign(moves=own & (table["shift"].abs() > OUTSIDE)), absent)
+    table = _without_idle(table.assign(moves=own & (table["shift"].abs() > LIMITS.outside)), absent)
     if table.empty:
         return Finding("passed")
     factors = table.groupby(["part", "alternative", "path"])["log_bayes_factor"].first()
@@ -489,7 +464,7 @@ def _alternatives(fit: FitView, absent: Sequence[Scalar]) -> Finding:
             f"({path}), by a Bayes factor of {_factor_text(highest)}; fit the scene that has it."
         )
         return judged_by(p_value, highest, sentence)
-    undecided = table[table["moves"] & (table["log_bayes_factor"] > REFUTED)]
+    undecided = table[table["moves"] & (table["log_bayes_factor"] > LIMITS.refuted)]
     if undecided.empty:
         return Finding("passed", p_value, highest)
     answers = [
@@ -501,7 +476,7 @@ def _alternatives(fit: FitView, absent: Sequence[Scalar]) -> Finding:
         f"The answer rests on a part that the readings do not decide: {listed(answers)}; unless "
         "you know the part, report both answers, as polar_bayes.compare_scenes gives them."
     )
-    is_favored = bool((undecided["log_bayes_factor"] > FAVORED).any())
+    is_favored = bool((undecided["log_bayes_factor"] > LIMITS.favored).any())
     return Finding("caution" if is_favored else "note", p_value, highest, sentence)
 
 

@@ -2,11 +2,9 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from polar_bayes.inference.checks import level
-
-MAX_LISTED = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,8 +35,13 @@ def p_text(p_value: float) -> str:
     return "p < 1e-6" if p_value < 1e-6 else f"p = {p_value:.2g}"
 
 
-def listed(items: Iterable[str]) -> str:
+def join(names: Sequence[str]) -> str:
+    """`a, b and c`."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+
+
+def listed(items: Iterable[str], most: int = 4) -> str:
     """The first items, and how many more there are: `roughness 1.08, exposure 1.03 and 2 more`."""
     items = list(items)
-    more = len(items) - MAX_LISTED
-    return ", ".join(items[:MAX_LISTED]) + (f" and {more} more" if more > 0 else "")
+    more = len(items) - most
+    return ", ".join(items[:most]) + (f" and {more} more" if more > 0 else "")

@@ -24,9 +24,6 @@ approximation, up to a constant."""
 WEIGHTED = ("importance",)
 """Methods whose draws were resampled from weighted ones."""
 
-# Of a population, and of a process over wavelength.
-HYPERPARAMETER_SUFFIXES = ("_location", "_spread", "_level", "_amplitude", "_length")
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scalar:
@@ -56,8 +53,8 @@ def with_entries[T](
 
 def is_hyperparameter(name: str, names: Collection[str]) -> bool:
     """True for what describes a population, or a process over wavelength, of another parameter."""
-    ends = (end for end in HYPERPARAMETER_SUFFIXES if name.endswith(end))
-    return any(name.removesuffix(end) in names for end in ends)
+    ends = ("_location", "_spread", "_level", "_amplitude", "_length")
+    return any(name.endswith(end) and name.removesuffix(end) in names for end in ends)
 
 
 def scalars(group: xr.Dataset, sample_dims: Sequence[str] = SAMPLE_DIMS) -> list[Scalar]:

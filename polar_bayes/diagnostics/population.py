@@ -17,7 +17,7 @@ import scipy.stats
 import xarray as xr
 
 from polar_bayes.diagnostics.parameters import Scalar
-from polar_bayes.diagnostics.view import FitView, once
+from polar_bayes.diagnostics.view import FitView, Provenance, once
 from polar_bayes.inference.result import CENTRAL_95, bounds_of
 from polar_bayes.priors import RANGES
 
@@ -145,7 +145,7 @@ def population_summary(result: xr.DataTree | FitView) -> pd.DataFrame:
 
 
 def _of_parameter(
-    name: str, found: Mapping[str, list[Scalar]], provenance: Mapping[str, Any]
+    name: str, found: Mapping[str, list[Scalar]], provenance: Provenance
 ) -> Iterator[Population]:
     for location in found[f"{name}_location"]:
         index = location.index.items()
@@ -192,11 +192,6 @@ def _pooling_factor(population: Population) -> float:
 
 
 # --- Shrinkage: each member with and without its population ---------------------------------------
-
-MAX_STEPS = 100
-TOLERANCE = 1e-10
-MIN_PRECISION_ERRORS = 2.0
-MIN_SPREAD = 1e-6
 
 
 @once
@@ -253,10 +248,10 @@ def unpooled_estimate(
     if not unit > 0.0:
         return UnpooledEstimate(math.nan, math.nan, math.nan)
     x, mu = (value - center) / unit, (location - center) / unit
-    precision = np.maximum(spread / unit, MIN_SPREAD) ** -2.0
+    precision = np.maximum(spread / unit, 1e-6) ** -2.0
     b, p = 0.0, max(1.0 - 1.0 / float(np.mean(1.0 / precision)), 0.1)
     lowest = -0.99 * float(precision.min())
-    for _ in range(MAX_STEPS):
+    for _ in range(100):
         gradient, curvature = _derivatives(x, mu, precision, b, p)
         step = np.linalg.solve(curvature, gradient)
         # Halved until every variance is positive and the density does not fall.
@@ -266,11 +261,11 @@ def unpooled_estimate(
         ):
             step = step / 2.0
         b, p = b + step[0], p + step[1]
-        if gradient @ step < TOLERANCE * x.size:
+        if gradient @ step < 1e-10 * x.size:
             break
     error = math.sqrt(np.linalg.inv(_derivatives(x, mu, precision, b, p)[1])[1, 1])
     weight = float(np.mean(precision / (precision + max(p, 0.0))))
-    if not p > MIN_PRECISION_ERRORS * error:
+    if not p > 2.0 * error:
         return UnpooledEstimate(math.nan, math.nan, weight)
     return UnpooledEstimate(center + unit * b / p, unit / math.sqrt(p), weight)
 

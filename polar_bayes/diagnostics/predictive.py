@@ -25,7 +25,6 @@ from polar_bayes.diagnostics.view import FitView, once
 from polar_bayes.numerics.psis import MAX_PARETO_K, smooth
 
 PROBABILITIES = (0.5, 0.8, 0.95)
-MAX_BAND_POINTS = 500
 COMPARABLE = MappingProxyType({"valid": True, "saturated": False})
 """Flags of readings that can be compared with a prediction."""
 
@@ -76,13 +75,13 @@ def predictive_checks(fit: FitView) -> dict[str, PredictiveCheck]:
     return {v.name: _check(v, relative_ess, correction) for v in flat_variables(fit)}
 
 
-def pit_band(pit: np.ndarray) -> PitBand | None:
+def pit_band(pit: np.ndarray, most: int = 500) -> PitBand | None:
     """Simultaneous band of the empirical distribution of PIT values; None for fewer than two."""
     pit = pit[np.isfinite(pit)]
     if pit.size < 2:
         return None
     # Beyond a few hundred values a coarser grid draws the same curve at a fraction of the cost.
-    pit = pit[:: -(-pit.size // MAX_BAND_POINTS)]
+    pit = pit[:: -(-pit.size // most)]
     at, lower, upper = _uniform_band(pit.size)
     ecdf = np.searchsorted(np.sort(pit), at, side="right") / pit.size
     ecdf[[0, -1]] = 0.0, 1.0

@@ -27,27 +27,12 @@ import numpy as np
 import xarray as xr
 
 from polar_bayes.diagnostics.finding import Finding, judged_by, listed, p_text
+from polar_bayes.diagnostics.limits import LIMITS
 from polar_bayes.diagnostics.predictive import FlatVariable, flat_variables
 from polar_bayes.diagnostics.view import FitView, once
 from polar_bayes.inference.checks import ANGLE_SCALES
 from polar_bayes.observation.data import ANGLES
 from polar_bayes.physics.geometry import unit_vectors
-
-REPLICATES = 1000
-MAX_READINGS = 600
-"""Readings that the checks use; of more, evenly spaced ones."""
-MAX_SATURATED = 0.01
-"""Share of the replicates at full scale beyond which the checks leave a reading out."""
-STATED_ERRORS = 3.0
-"""Stated errors within which a reading is no outlier, however little the others scatter."""
-MAX_LEVERAGE = 0.999
-"""Draws may give a reading more than all of the information about itself."""
-LARGE_SHIFT = 1.0
-"""Change of a posterior mean without one reading that counts, in posterior sds."""
-KNOWN_TOO = 0.2
-"""One minus the leverage of a reading from which the others know what it says, and may disagree."""
-ALONE = 2.0
-"""Factor by which an interval would widen without a reading that is named as its source."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -84,13 +69,13 @@ def residuals_of(fit: FitView) -> Residuals | None:
     sd = noise.std(axis=0)
     # Replicates of a reading near full scale are cut off there, and have no residuals of their own.
     cut = np.concatenate([(v.predicted >= v.full_scale).mean(axis=0) for v in variables])
-    keep = np.flatnonzero((sd > 0.0) & (cut < MAX_SATURATED))
-    keep = keep[:: max(1, -(-keep.size // MAX_READINGS))]
+    keep = np.flatnonzero((sd > 0.0) & (cut < LIMITS.saturated))
+    keep = keep[:: max(1, -(-keep.size // LIMITS.readings))]
     if keep.size < 4 or len(noise) < 100:
         return None
     noise, noise_free, sd = noise[:, keep] / sd[keep], noise_free[:, keep] / sd[keep], sd[keep]
     random = np.random.default_rng(0)
-    pick = random.permutation(len(noise))[:REPLICATES]
+    pick = random.permutation(len(noise))[: LIMITS.replicates]
     centered = noise_free - noise_free.mean(axis=0)
     covariance = centered.T @ centered / (len(centered) - 1)
     replicated = noise[pick] - noise[pick] @ covariance
@@ -106,7 +91,7 @@ def residuals_of(fit: FitView) -> Residuals | None:
         observed=observed[keep] / sd - noise_free.mean(axis=0),
         replicated=replicated,
         stated=np.concatenate([each.stated for each in where])[keep] / sd,
-        left_out=np.maximum(replicated.var(axis=0), 1.0 - MAX_LEVERAGE),
+        left_out=np.maximum(replicated.var(axis=0), 1.0 - LIMITS.leverage),
         gains=scores @ centered / (len(centered) - 1),
         parameters=tuple(material),
         directions=np.concatenate([each.directions for each in where])[keep],
@@ -248,7 +233,7 @@ def _outliers(residuals: Residuals) -> Finding:
 
     # Where all readings scatter less than stated, one that keeps to its statement is no outlier.
     size = np.abs(residuals.observed)
-    beyond = np.where(size > STATED_ERRORS * residuals.stated, size, 0.0)
+    beyond = np.where(size > LIMITS.stated_errors * residuals.stated, size, 0.0)
     observed = float(beyond.max() / np.sqrt(np.mean(size**2)))
     p_value = _p_value(observed, largest(residuals.replicated))
     farthest = residuals.labels[int(beyond.argmax())]
@@ -271,7 +256,7 @@ def _influence(residuals: Residuals) -> Finding:
 
     def contradiction(e: np.ndarray) -> np.ndarray:
         """Residuals without the reading itself, in their own sd, where it moves the answer."""
-        moves = (gain * np.abs(e) > LARGE_SHIFT) & (left_out > KNOWN_TOO)
+        moves = (gain * np.abs(e) > LIMITS.large_shift) & (left_out > LIMITS.known_too)
         return np.where(moves, np.abs(e) / np.sqrt(left_out), 0.0)
 
     observed = contradiction(residuals.observed)
@@ -299,5 +284,5 @@ def readings_alone(residuals: Residuals | None) -> dict[str, tuple[str, float]]:
     return {
         name: (residuals.labels[at], float(factors[at]))
         for name, factors, at in zip(residuals.parameters, widened, best, strict=True)
-        if factors[at] > ALONE
+        if factors[at] > LIMITS.alone
     }

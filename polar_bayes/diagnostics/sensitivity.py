@@ -19,16 +19,12 @@ import pandas as pd
 import xarray as xr
 from arviz_stats.base import array_stats
 
+from polar_bayes.diagnostics.limits import LIMITS
 from polar_bayes.diagnostics.parameters import MIN_DRAWS, SAMPLE_DIMS
 from polar_bayes.diagnostics.residuals import readings_alone, residuals_of
 from polar_bayes.diagnostics.view import FitView, once
 from polar_bayes.inference.result import CENTRAL_95
 
-DETERMINED = 0.5
-"""Prior probability inside the posterior's 95% interval; normal ones, a third as wide, have it."""
-PARTLY = 0.85
-"""The same at three quarters of the width; a posterior equal to its prior has 0.95."""
-SENSITIVE = 0.05
 POWERS = (0.99, 1.01)
 COLUMNS = (
     *("prior_q2.5", "prior_q97.5", "q2.5", "q97.5", "prior_inside", "width_left", "contraction"),
@@ -68,8 +64,8 @@ def _compare(prior: np.ndarray | None, posterior: np.ndarray) -> list[Any]:
     with np.errstate(all="ignore"):  # the variance of huge numbers overflows
         contraction = 1.0 - float(np.var(posterior) / np.var(prior))
     verdict = "not determined"
-    if inside <= PARTLY:
-        verdict = "determined" if inside <= DETERMINED else "partly"
+    if inside <= LIMITS.partly:
+        verdict = "determined" if inside <= LIMITS.determined else "partly"
     return [*ends, inside, (high - low) / prior_width, contraction, verdict]
 
 
@@ -119,7 +115,7 @@ def _remarks(draws: np.ndarray, compared: list[Any], prior: float, likelihood: f
     median, remarks = float(np.median(draws)), []
     if median < prior_low or median > prior_high:
         remarks.append("outside the prior's 95%")
-    if prior >= SENSITIVE:
-        pulled = likelihood >= SENSITIVE
+    if prior >= LIMITS.sensitive:
+        pulled = likelihood >= LIMITS.sensitive
         remarks.append("priors and data may pull apart" if pulled else "leans on the priors")
     return remarks

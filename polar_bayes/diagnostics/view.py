@@ -16,6 +16,9 @@ from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.result import provenance_of
 
+type Provenance = Mapping[str, Any]
+"""How a result was made, as JSON holds it."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FitView:
@@ -23,14 +26,14 @@ class FitView:
 
     Args:
         result: The tree.
-        computed: Results of functions that `once` decorates, by the function.
+        computed: Results of functions that `once` decorates, by function and arguments.
     """
 
     result: xr.DataTree
-    computed: dict[Callable[..., Any], Any] = dataclasses.field(default_factory=dict, repr=False)
+    computed: dict[tuple[object, ...], Any] = dataclasses.field(default_factory=dict, repr=False)
 
     @functools.cached_property
-    def provenance(self) -> dict[str, Any]:
+    def provenance(self) -> Provenance:
         """How the fit was made; null entries are left out."""
         return provenance_of(self.result)
 
@@ -92,16 +95,14 @@ def view_of(result: xr.DataTree | FitView, source: str = "result") -> FitView:
 def once[**P, R](
     compute: Callable[Concatenate[FitView, P], R],
 ) -> Callable[Concatenate[xr.DataTree | FitView, P], R]:
-    """Compute of a tree or a view, once for each view; with further arguments nothing is kept."""
+    """Compute of a tree or a view, once for each view and further arguments."""
 
     @functools.wraps(compute)
     def wrapper(result: xr.DataTree | FitView, *args: P.args, **kwargs: P.kwargs) -> R:
-        fit = view_of(result)
-        if args or kwargs:
-            return compute(fit, *args, **kwargs)
-        if compute not in fit.computed:
-            fit.computed[compute] = compute(fit, *args, **kwargs)
-        found: R = fit.computed[compute]
+        fit, key = view_of(result), (compute, args, *kwargs.items())
+        if key not in fit.computed:
+            fit.computed[key] = compute(fit, *args, **kwargs)
+        found: R = fit.computed[key]
         return found
 
     return wrapper

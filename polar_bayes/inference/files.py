@@ -503,7 +503,12 @@ def auto_sentences(result: xr.DataTree) -> list[str]:
         FitError: It is no fit, or does not hold together.
     """
     check_fit(result)
-    summary = provenance_of(result).get("auto")
+    return sentences_of_auto(provenance_of(result))
+
+
+def sentences_of_auto(provenance: Mapping[str, Any]) -> list[str]:
+    """What `method="auto"` tried, from the provenance of a fit that was checked."""
+    summary = provenance.get("auto")
     if not summary:
         return []
     sentences = []

@@ -3,7 +3,6 @@
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,11 +16,11 @@ from matplotlib.transforms import Bbox
 
 from polar_bayes.benchmark.advice import (
     AS_GIVEN,
-    RESOLVED,
-    accuracy_dataset,
+    AccuracyView,
+    Study,
     accuracy_sentences,
-    accuracy_table,
-    parameter_errors,
+    accuracy_view,
+    pareto_front,
 )
 from polar_bayes.errors import FitError
 from polar_bayes.inference.result import provenance_of
@@ -30,21 +29,9 @@ from polar_bayes.reporting.style import BLUE, GRAY, GREEN, ORANGE, PURPLE, SKY, 
 from polar_bayes.reporting.text import DASH, column, or_dash
 from polar_bayes.repr_html import Table
 
-METHOD, VARIATION = "method", "override"
-"""Names of the dimensions of a study: a method, and what was changed of it."""
-
-WINE, INDIGO = "#882255", "#332288"  # Paul Tol's muted scheme
-COLORS = (VERMILLION, ORANGE, SKY, GREEN, PURPLE, WINE, GRAY, BLUE, INDIGO)
+# The last two of the dark ones are of Paul Tol's muted scheme.
+COLORS = (VERMILLION, ORANGE, SKY, GREEN, PURPLE, "#882255", GRAY, BLUE, "#332288")
 MARKERS = ("o", "^", "v", "s", "D", "P", "X", "*")
-LETTER_WIDTH, LINE_HEIGHT = 5.2, 10.0
-"""Approximate size of a label's letters, unit point: labels are placed before they are drawn."""
-
-OFFSETS = tuple((right, up) for step in ((0, 8, -8), (18, -18)) for right in (6, -6) for up in step)
-"""Positions of a label relative to its point, unit point; the first free one is taken."""
-
-NEAR = 8
-"""Unit point: a label that is higher or lower has a line to its point."""
-
 TIME_LABELS = {
     "seconds_first": "time of a first fit, compilation included [s]",
     "seconds_again": "time of the next fit, nothing to compile [s]",
@@ -52,9 +39,7 @@ TIME_LABELS = {
 
 
 @style.styled
-def plot_accuracy(
-    result: xr.DataTree | xr.Dataset, *, times: Sequence[str] | None = None
-) -> Figure:
+def plot_accuracy(result: Study, *, times: Sequence[str] | None = None) -> Figure:
     """Error against time of every method and its variations, with the Pareto front.
 
     Args:
@@ -70,8 +55,8 @@ def plot_accuracy(
     Raises:
         FitError: It holds no accuracy study, or no such column.
     """
-    study = accuracy_dataset(result)
-    table = accuracy_table(study)
+    study = accuracy_view(result)
+    table = study.table
     shown = list(times) if times is not None else [t for t in TIME_LABELS if table[t].notna().any()]
     unknown = [name for name in shown if name not in TIME_LABELS]
     if unknown or not shown:
@@ -86,42 +71,42 @@ def plot_accuracy(
         front_panel(axes, study, name)
         if at == 0:
             axes.set_ylabel("largest error of a mean or sd [posterior sd]")
-    markers = _assign(table[VARIATION], MARKERS)
+    markers = _assign(table["override"], MARKERS)
     if len(markers) > 1:
         fills = [GRAY, *["none"] * (len(markers) - 1)]
         handles = [
             Line2D([], [], ls="", marker=marker, mfc=fill, mec=GRAY, label=variation)
             for fill, (variation, marker) in zip(fills, markers.items(), strict=True)
         ]
-        place: Any = {"loc": "outside lower center", "ncols": 4 * len(shown)}
+        place: style.Look = {"loc": "outside lower center", "ncols": 4 * len(shown)}
         figure.legend(handles=handles, frameon=False, **place)
     return figure
 
 
-def front_panel(axes: Axes, study: xr.Dataset, time: str) -> None:
+def front_panel(axes: Axes, study: AccuracyView, time: str) -> None:
     """One panel of `plot_accuracy`."""
-    table, noise = accuracy_table(study), float(study.attrs["reference_error"])
+    table, noise = study.table, study.resolved
     # Logarithmic axes cannot show a time of zero.
     known = table[np.isfinite(table["error"]) & np.isfinite(table[time]) & (table[time] > 0.0)]
-    colors, markers = _assign(table[METHOD], COLORS), _assign(table[VARIATION], MARKERS)
+    colors, markers = _assign(table["method"], COLORS), _assign(table["override"], MARKERS)
     axes.set(xscale="log", yscale="log", xlabel=TIME_LABELS[time])
-    axes.axhspan(1e-9, RESOLVED * noise, color=style.lighten(GRAY, 0.85), lw=0, zorder=0)
-    front = _pareto_front(known, time)
+    axes.axhspan(1e-9, noise, color=style.lighten(GRAY, 0.85), lw=0, zorder=0)
+    is_front = pareto_front(known[time].to_numpy(), known["error"].to_numpy())
+    front = known[is_front].sort_values(time)
     axes.plot(front[time], front["error"], color=GRAY, lw=1.0, drawstyle="steps-post", zorder=1)
     for _, row in known.iterrows():
-        given, color = row[VARIATION] == AS_GIVEN, colors[row[METHOD]]
-        look: Any = {"mfc": color, "ms": 6.5, "zorder": 3}
+        given, color = row["override"] == AS_GIVEN, colors[row["method"]]
+        look: style.Look = {"mfc": color, "ms": 6.5, "zorder": 3}
         look = look if given else {"mfc": "none", "ms": 4.5, "zorder": 2}
-        marker = markers[row[VARIATION]]
+        marker = markers[row["override"]]
         axes.plot(row[time], row["error"], ls="", marker=marker, mec=color, **look)
     if not known.empty:  # with room for a name on the right
         error = known["error"].clip(lower=1e-6)
         axes.set_xlim(float(known[time].min()) / 1.6, float(known[time].max()) * 3.0)
-        axes.set_ylim(min(float(error.min()), noise) / 1.6, float(error.max()) * 1.8)
+        axes.set_ylim(min(float(error.min()), noise / 2.0) / 1.6, float(error.max()) * 1.8)
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))  # often less than a decade
     style.plain_numbers(axes.xaxis, axes.yaxis)
     _name_methods(axes, known, time, colors)
-    style.set_tick_style(axes)
 
 
 def _assign(names: pd.Series, values: Sequence[str]) -> dict[str, str]:
@@ -129,37 +114,32 @@ def _assign(names: pd.Series, values: Sequence[str]) -> dict[str, str]:
     return dict(zip(dict.fromkeys(names), itertools.cycle(values), strict=False))
 
 
-def _pareto_front(known: pd.DataFrame, time: str) -> pd.DataFrame:
-    """Rows that are better than all faster ones."""
-    ordered = known.sort_values([time, "error"], kind="stable")
-    before = ordered["error"].cummin().shift(fill_value=np.inf)
-    return ordered[ordered["error"] < before]
-
-
 def _name_methods(axes: Axes, known: pd.DataFrame, time: str, colors: dict[str, str]) -> None:
     """The name of each method next to its point, where it covers no other name or point."""
     figure = axes.get_figure()
+    # In points; sizes of letters are approximate, for labels are placed before they are drawn.
     scale = 72.0 / (figure.dpi if figure is not None else 100.0)
     points = axes.transData.transform(known[[time, "error"]].to_numpy(float)) * scale
     taken = [Bbox.from_bounds(x - 3, y - 3, 6, 6) for x, y in points]
-    is_given = (known[VARIATION] == AS_GIVEN).to_numpy()
+    offsets = [(x, up) for ups in ((0, 8, -8), (18, -18)) for x in (6, -6) for up in ups]
+    is_given = (known["override"] == AS_GIVEN).to_numpy()
     for (x, y), (_, row) in zip(points[is_given], known[is_given].iterrows(), strict=True):
-        name = row[METHOD]
-        width = LETTER_WIDTH * len(name)
-        for right, up in OFFSETS:
+        name = row["method"]
+        width = 5.2 * len(name)
+        for right, up in offsets:
             left = x + (right if right > 0 else right - width)
-            box = Bbox.from_bounds(left, y + up - 5, width, LINE_HEIGHT)
+            box = Bbox.from_bounds(left, y + up - 5, width, 10.0)
             if not any(box.overlaps(other) for other in taken):
                 break
         taken.append(box)
         line = {"arrowstyle": "-", "color": colors[name], "lw": 0.6}
-        place: Any = {"xytext": (right, up), "textcoords": "offset points", "va": "center"}
+        place: style.Look = {"xytext": (right, up), "textcoords": "offset points", "va": "center"}
         axes.annotate(
             style.label_text(name),
             (float(row[time]), float(row["error"])),
             ha="left" if right > 0 else "right",
             **{**place, "fontsize": 8, "color": colors[name]},
-            arrowprops=line if abs(up) > NEAR else None,
+            arrowprops=line if abs(up) > 8 else None,
             path_effects=[withStroke(linewidth=2.5, foreground=style.background())],
         )
 
@@ -169,7 +149,7 @@ def _name_methods(axes: Axes, known: pd.DataFrame, time: str, colors: dict[str, 
 
 def accuracy_page(result: xr.DataTree) -> page.Page:
     """The page of an accuracy study."""
-    study, provenance = accuracy_dataset(result), provenance_of(result)
+    study, provenance = accuracy_view(result), provenance_of(result)
     facts = page.make_facts(
         {str(key).replace("_", " "): value for key, value in provenance.items()}
     )
@@ -184,7 +164,7 @@ def accuracy_page(result: xr.DataTree) -> page.Page:
         name=text.capture_name(provenance),
         subtitles=[text.made_by(provenance, "every method of the study")],
         headline=" ".join(accuracy_sentences(study)),
-        passed=not study.attrs["reference_doubts"],
+        passed=not study.doubts,
         sentences=[text.reference_sentence(study)],
         sections=sections,
         footer="Computed from accuracy.nc, which lies in the same folder.",
@@ -193,24 +173,23 @@ def accuracy_page(result: xr.DataTree) -> page.Page:
 
 def accuracy_card(result: xr.DataTree) -> page.Card:
     """The card of an accuracy study."""
-    study = accuracy_dataset(result)
+    study = accuracy_view(result)
     sentences = [*accuracy_sentences(study), text.reference_sentence(study)]
-    return sentences, study_table(study), not study.attrs["reference_doubts"]
+    return sentences, study_table(study), not study.doubts
 
 
-def accuracy_picture(study: xr.Dataset) -> page.Picture:
+def accuracy_picture(study: AccuracyView) -> page.Picture:
     """Error against time."""
     return page.picture(plot_accuracy(study), "accuracy.figure_front")
 
 
-def study_table(study: xr.Dataset) -> Table:
+def study_table(study: AccuracyView) -> Table:
     """A row for each method and each variation of it."""
-    noise = float(study.attrs["reference_error"])
-    table = accuracy_table(study)
+    table = study.table
 
     def error(row: pd.Series) -> str:
         if math.isfinite(row["error"]) and not row["resolved"]:
-            return f"< {RESOLVED * noise:.2g}"
+            return f"< {study.resolved:.2g}"
         return or_dash(row["error"], ".2g")
 
     marks = {
@@ -231,18 +210,16 @@ def study_table(study: xr.Dataset) -> Table:
         "gradients": column("gradients", ",.0f"),
         "densities": column("densities", ",.0f"),
     }
-    caption = page.caption("accuracy.study")
     return page.make_table(
-        "study", caption, cells, table, label="method", descriptions=marks, prose=["method"]
+        "accuracy.study", cells, table, label="method", descriptions=marks, prose=["method"]
     )
 
 
-def error_table(study: xr.Dataset) -> Table:
+def error_table(study: AccuracyView) -> Table:
     """Errors of every parameter by the methods as given."""
-    errors = parameter_errors(study)[study[VARIATION].to_numpy() == AS_GIVEN]
+    errors = study.errors[study.is_given]
     cells: page.Cells = {str(name): column(name, ".2g") for name in errors.columns}
-    caption = "The larger error of mean and standard deviation of each, in posterior sds."
-    return page.make_table("error", caption, cells, errors, label="method")
+    return page.make_table("accuracy.error", cells, errors, label="method")
 
 
 REPORT = page.Report(accuracy_page, accuracy_card, plot_accuracy, file="accuracy.nc")

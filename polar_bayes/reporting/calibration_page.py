@@ -26,6 +26,7 @@ from polar_bayes.calibration.verdict import (
     reading_ranks,
 )
 from polar_bayes.diagnostics.coverage import INTERVALS
+from polar_bayes.diagnostics.view import Provenance
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.inference.result import provenance_of
@@ -40,7 +41,6 @@ from polar_bayes.reporting.text import DASH, column, number
 from polar_bayes.repr_html import Table
 
 MAX_OTHERS = 4
-RANKS_COLUMN, JUDGED_COLUMN = "the ranks", "the tests"
 
 
 def calibration_page(
@@ -177,14 +177,17 @@ def rank_table(table: pd.DataFrame, ranks: Mapping[str, Ranks]) -> Table:
 
     cells: page.Cells = {
         "p": text.p_value(level),
-        JUDGED_COLUMN: lambda row: parameter_deviation(row, level) or PASSES,
+        "the tests": lambda row: parameter_deviation(row, level) or PASSES,
         "failed": lambda row: f"{int(row['failed']):,} of {simulations:,}",
         **_score_cells(),
     }
-    caption = page.caption("calibration.parameter", level=level)
     titles = {label: each.title for label, each in ranks.items()}
-    data, prose = table.loc[list(ranks)], [JUDGED_COLUMN]
-    return page.make_table("parameter", caption, cells, data, descriptions=titles, prose=prose)
+    return page.make_table(
+        *("calibration.parameter", cells, table.loc[list(ranks)]),
+        descriptions=titles,
+        prose=["the tests"],
+        level=level,
+    )
 
 
 def comparison_table(compared: pd.DataFrame, titles: Mapping[str, str]) -> Table:
@@ -195,14 +198,16 @@ def comparison_table(compared: pd.DataFrame, titles: Mapping[str, str]) -> Table
     cells: page.Cells = {
         "method": page.second_label,
         "p": text.p_value(level),
-        JUDGED_COLUMN: lambda row: row["deviation"],
+        "the tests": lambda row: row["deviation"],
         "failed": lambda row: f"{int(row['failed']):,}",
         f"score against {first}": _score_change,
         **_score_cells(),
     }
-    caption = page.caption("calibration.comparison", first=first)
     return page.make_table(
-        "comparison", caption, cells, compared, descriptions=titles, prose=[JUDGED_COLUMN]
+        *("calibration.comparison", cells, compared),
+        descriptions=titles,
+        prose=["the tests"],
+        first=first,
     )
 
 
@@ -234,21 +239,19 @@ def _readings(
     pictures = _paged(ranks, lambda some: figures.ecdf_differences(some, {}, method), "readings")
     cells: page.Cells = {
         "p": text.p_value(level),
-        RANKS_COLUMN: lambda row: "uniform" if row["p_value"] >= level else reading_deviation(row),
+        "the ranks": lambda row: "uniform" if row["p_value"] >= level else reading_deviation(row),
         "failed": lambda row: f"{int(row['failed']):,} of {int(row['answered'] + row['failed']):,}",
         "mean rank": column("rank_mean", ".3f"),
         "spread": column("rank_spread", ".3f"),
         "untrusted": column("untrusted", ",.0f"),
     }
-    caption = page.caption("calibration.reading", level=level, largest_trusted=MAX_PARETO_K)
     table = page.make_table(
-        "reading",
-        caption,
-        cells,
-        readings,
+        *("calibration.reading", cells, readings),
         label="reading",
         descriptions=titles,
-        prose=[RANKS_COLUMN],
+        prose=["the ranks"],
+        level=level,
+        largest_trusted=MAX_PARETO_K,
     )
     note = "Readings are judged by themselves; the verdict above is that of the parameters."
     return [note, table, *pictures]
@@ -258,12 +261,11 @@ def _fit_tables(calibration: xr.DataTree, ranks: Mapping[str, Ranks]) -> Iterato
     """Numbers of fits by status and by approach."""
     fits = calibration["fits"].to_dataset()
     answered = np.all([np.isfinite(each.pit) for each in ranks.values()], axis=0)
-    approach = "How the numbers of each fit were found."
-    tables: dict[str, tuple[type[enum.IntEnum], Mapping[str, str], str]] = {
-        "status": (Status, STATUSES, page.caption("calibration.status")),
-        "approach": (MethodUsed, text.APPROACHES, approach),
+    tables: dict[str, tuple[type[enum.IntEnum], Mapping[str, str]]] = {
+        "status": (Status, STATUSES),
+        "approach": (MethodUsed, text.APPROACHES),
     }
-    for name, (known, meanings, caption) in tables.items():
+    for name, (known, meanings) in tables.items():
         if name not in fits:
             continue
         names = " ".join(each.name.lower() for each in known)
@@ -274,7 +276,7 @@ def _fit_tables(calibration: xr.DataTree, ranks: Mapping[str, Ranks]) -> Iterato
             if chosen.any():
                 counts[meaning] = [int(chosen.sum()), int(answered[chosen].sum())]
         data = pd.DataFrame.from_dict(counts, orient="index", columns=["fits", "with ranks"])
-        yield count_table(name, caption, data, meanings)
+        yield count_table(f"calibration.{name}", data, meanings)
 
 
 def _fit_facts(calibration: xr.DataTree) -> dict[str, str]:
@@ -296,7 +298,7 @@ def _fit_facts(calibration: xr.DataTree) -> dict[str, str]:
     return facts
 
 
-def _provenance_facts(provenance: Mapping[str, Any]) -> Iterator[page.Block]:
+def _provenance_facts(provenance: Provenance) -> Iterator[page.Block]:
     """How the calibration was made, in titled groups of names and values."""
     titles = {
         "truth": "What captures were simulated by, where it differs from what is fitted",

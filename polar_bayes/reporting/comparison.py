@@ -1,7 +1,6 @@
 """The report of several fits of one capture: which predicts best, and where they disagree."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -10,7 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from polar_bayes.diagnostics.compare import FitComparison, compare_fits
-from polar_bayes.diagnostics.sensitivity import SENSITIVE
+from polar_bayes.diagnostics.limits import LIMITS
+from polar_bayes.diagnostics.view import Provenance
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import page, style, text
@@ -20,11 +20,6 @@ from polar_bayes.reporting.text import CLEAR, DASH, column, interval, number, or
 from polar_bayes.repr_html import Row, Table
 
 COLORS = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY, GRAY)
-ASKED = (
-    *("method", "settings", "model", "model_settings", "scene", "scene_parts", "links", "priors"),
-    *("fixed", "largest_view_zenith", "seed", "precision"),
-)
-"""Entries of the provenance in which fits may differ."""
 
 
 @style.styled
@@ -54,7 +49,7 @@ def plot_comparison(comparison: FitComparison) -> Figure:
         for name, row in finite.xs(label, level="parameter").iterrows():
             at, color = -fits.index(str(name)), colors[str(name)]
             ends = [row["q2.5"], row["q97.5"]]
-            line: Any = "-"
+            line: str | tuple[int, tuple[int, int]] = "-"
             if not np.isfinite(ends).all():  # a point fit
                 ends = [row["mean"] - 2.0 * row["sd"], row["mean"] + 2.0 * row["sd"]]
                 line = (0, (2, 1))
@@ -64,7 +59,6 @@ def plot_comparison(comparison: FitComparison) -> Figure:
         axes.spines["left"].set_visible(False)
         axes.locator_params(axis="x", nbins=5)
         style.set_panel_title(axes, style.label_text(label.replace("_", " ")))
-    style.set_tick_style(panels)
     handles = [
         Line2D([], [], color=color, marker="o", ms=4.5, lw=2.0, label=style.label_text(name, 24))
         for name, color in colors.items()
@@ -117,8 +111,7 @@ def loo_table(comparison: FitComparison) -> Table:
         "weight": lambda row: f"{row['weight']:.2f}",
         "k > 0.7": lambda row: f"{int(row['unreliable'])}",
     }
-    caption = page.caption("comparison.loo", clear=CLEAR)
-    return page.make_table("loo", caption, cells, comparison.loo, label="fit")
+    return page.make_table("comparison.loo", cells, comparison.loo, label="fit", clear=CLEAR)
 
 
 def parameter_table(comparison: FitComparison) -> Table:
@@ -131,9 +124,7 @@ def parameter_table(comparison: FitComparison) -> Table:
         "R-hat": column("r_hat", ".3f"),
         "ESS": lambda row: or_dash(np.floor(row["ess_bulk"]), ".0f"),
     }
-    caption = "Posterior mean, standard deviation and equal-tailed 95% interval by each fit."
-    data = comparison.parameters
-    return page.make_table("parameter", caption, cells, data, prose=["fit"])
+    return page.make_table("comparison.parameter", cells, comparison.parameters, prose=["fit"])
 
 
 def sensitivity_table(comparison: FitComparison) -> Table | None:
@@ -147,12 +138,13 @@ def sensitivity_table(comparison: FitComparison) -> Table | None:
         "by the data": lambda row: str(row["verdict"]),
         **text.SENSITIVITY_CELLS,
     }
-    caption = page.caption("comparison.sensitivity", sensitive=SENSITIVE)
     prose = ["fit", "remark"]
-    return page.make_table("sensitivity", caption, cells, known, prose=prose)
+    return page.make_table(
+        "comparison.sensitivity", cells, known, prose=prose, sensitive=LIMITS.sensitive
+    )
 
 
-def settings_table(provenances: Mapping[str, Mapping[str, Any]]) -> Table:
+def settings_table(provenances: Mapping[str, Provenance]) -> Table:
     """What the fits were asked for, where it is not the same for all."""
     settings = [_settings(each) for each in provenances.values()]
     rows = []
@@ -166,9 +158,12 @@ def settings_table(provenances: Mapping[str, Mapping[str, Any]]) -> Table:
     return Table(("asked for", *names), tuple(rows), names, "settings", caption, data)
 
 
-def _settings(provenance: Mapping[str, Any]) -> dict[str, str]:
+def _settings(provenance: Provenance) -> dict[str, str]:
     found = {}
-    for key in ASKED:
+    for key in (
+        *("method", "settings", "model", "model_settings", "scene", "scene_parts", "links"),
+        *("priors", "fixed", "largest_view_zenith", "seed", "precision"),
+    ):
         value = provenance.get(key)
         for part, each in (value if isinstance(value, Mapping) else {"": value}).items():
             if each is not None:

@@ -10,19 +10,20 @@ import pandas as pd
 import xarray as xr
 from matplotlib.figure import Figure
 
-from polar_bayes.benchmark.advice import accuracy_dataset, accuracy_sentences
+from polar_bayes.benchmark.advice import accuracy_sentences, accuracy_view
 from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.alternatives import alternatives
 from polar_bayes.diagnostics.compare import WITHOUT, compare_without
-from polar_bayes.diagnostics.criticism import QUESTIONS, REFUTED, criticize
+from polar_bayes.diagnostics.criticism import QUESTIONS, criticize
+from polar_bayes.diagnostics.limits import LIMITS
 from polar_bayes.diagnostics.parameters import APPROXIMATIONS, is_hyperparameter
 from polar_bayes.diagnostics.population import population_summary, populations, shrinkage
 from polar_bayes.diagnostics.predictive import PROBABILITIES, PredictiveCheck, predictive_checks
-from polar_bayes.diagnostics.sensitivity import DETERMINED, PARTLY, SENSITIVE, sensitivity
-from polar_bayes.diagnostics.view import FitView, view_of
+from polar_bayes.diagnostics.sensitivity import sensitivity
+from polar_bayes.diagnostics.view import FitView, Provenance, view_of
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.checks import CAUTION, PROBLEM
-from polar_bayes.inference.files import auto_sentences
+from polar_bayes.inference.files import sentences_of_auto
 from polar_bayes.methods.registry import METHODS
 from polar_bayes.numerics.psis import MAX_PARETO_K
 from polar_bayes.priors import short_numbers
@@ -35,16 +36,10 @@ from polar_bayes.repr_html import Row, Table
 from polar_bayes.results import summary, verdict
 from polar_bayes.scenes.sentences import scene_sentences, scene_table
 
-SHARED_GROUP = "Populations and spectra"
 INSTRUMENT_GROUP = "Instrument and noise"
 TRUTH = "true value"
 """A column that is left out where no true value is known."""
 
-SCALES = {
-    "log": "on the scale of its logarithm",
-    "log odds": "on the scale of its log odds",
-    "plain": "on its own scale",
-}
 MAX_POPULATIONS = 6
 PROVENANCE_GROUPS = {
     "model_settings": "Settings of the model",
@@ -61,7 +56,7 @@ PROVENANCE_GROUPS = {
 
 
 def fit_table(
-    fit: FitView, name: str, caption: str, cells: page.Cells, data: pd.DataFrame, prose: str = ""
+    fit: FitView, key: str, cells: page.Cells, data: pd.DataFrame, **options: Any
 ) -> Table:
     """A table with a row for each parameter that the numbers have, in groups."""
     names = set(map(str, fit.posterior.data_vars))
@@ -71,7 +66,7 @@ def fit_table(
             titles[scalar.label] = parameter_title(scalar, fit.posterior)
             groups[scalar.label] = "" if scalar.is_material else INSTRUMENT_GROUP
             if is_hyperparameter(scalar.name, names):
-                groups[scalar.label] = SHARED_GROUP
+                groups[scalar.label] = "Populations and spectra"
     data = data.loc[list(titles)]
     if TRUTH in cells:
         truths = pd.Series({each.label: fit.truth(each) for each in fit.scalars})
@@ -79,9 +74,7 @@ def fit_table(
             data = data.assign(true_value=truths)
         else:
             cells = {title: cell for title, cell in cells.items() if title != TRUTH}
-    return page.make_table(
-        name, caption, cells, data, descriptions=titles, groups=groups, prose=[prose]
-    )
+    return page.make_table(key, cells, data, descriptions=titles, groups=groups, **options)
 
 
 def has_draws(fit: FitView) -> bool:
@@ -177,9 +170,9 @@ def parameter_table(fit: FitView) -> Table:
         "prior inside": lambda row: percent(row["prior_inside"]),
         "by the data": lambda row: str(row["verdict"]),
     }
-    caption = page.caption("fit.parameter", determined=DETERMINED, partly=PARTLY)
     data = convergence.summary(fit).join(sensitivity(fit)[["prior_inside", "verdict"]])
-    return fit_table(fit, "parameter", caption, cells, data)
+    limits = {"determined": LIMITS.determined, "partly": LIMITS.partly}
+    return fit_table(fit, "fit.parameter", cells, data, **limits)
 
 
 def _truth_cell(row: pd.Series) -> str:
@@ -198,10 +191,9 @@ def _estimate_table(fit: FitView) -> Table:
         "standard error": error,
         TRUTH: lambda row: number(row["true_value"], row["standard_error"]),
     }
-    caption = "Least squares; standard errors from the curvature and the residuals."
     data = convergence.summary(fit)[["mean", "sd"]]
     data = data.set_axis(["estimate", "standard_error"], axis="columns")
-    return fit_table(fit, "parameter", caption, cells, data)
+    return fit_table(fit, "fit.estimate", cells, data, name="parameter")
 
 
 def sensitivity_table(fit: FitView) -> Table:
@@ -212,8 +204,8 @@ def sensitivity_table(fit: FitView) -> Table:
         "width left": lambda row: percent(row["width_left"]),
         **text.SENSITIVITY_CELLS,
     }
-    caption = page.caption("fit.sensitivity", sensitive=SENSITIVE)
-    return fit_table(fit, "sensitivity", caption, cells, sensitivity(fit), prose="remark")
+    options = {"prose": ["remark"], "sensitive": LIMITS.sensitive}
+    return fit_table(fit, "fit.sensitivity", cells, sensitivity(fit), **options)
 
 
 def _pairs(fit: FitView) -> Iterator[page.Picture]:
@@ -244,8 +236,7 @@ def _scenes(result: xr.DataTree) -> Iterator[page.Block]:
         **{name: operator.itemgetter(name) for name in texts},
         "criticism": lambda row: row["criticism"] or DASH,
     }
-    caption = page.caption("fit.scene")
-    yield page.make_table("scene", caption, cells, table, label="scene", prose=["criticism"])
+    yield page.make_table("fit.scene", cells, table, label="scene", prose=["criticism"])
 
 
 def _criticism(fit: FitView) -> Iterator[page.Block]:
@@ -259,15 +250,13 @@ def _criticism(fit: FitView) -> Iterator[page.Block]:
         "p": column("p_value", ".2g"),
         "what it says": lambda row: row["sentence"] or DASH,
     }
-    caption = page.caption("fit.criticism", caution=CAUTION, problem=PROBLEM)
     yield page.make_table(
-        "criticism",
-        caption,
-        cells,
-        criticize(fit),
+        *("fit.criticism", cells, criticize(fit)),
         label="check",
         descriptions=QUESTIONS,
         prose=["what it says"],
+        caution=CAUTION,
+        problem=PROBLEM,
     )
     yield from _alternatives(fit)
 
@@ -288,8 +277,8 @@ def _alternatives(fit: FitView) -> Iterator[page.Block]:
         "would be": column("other", ".4g"),
         "shift (sd)": lambda row: "redefined" if row["redefined"] else f"{row['shift']:+.1f}",
     }
-    caption = page.caption("fit.alternative", better=-math.log(CAUTION), refuted=REFUTED)
-    yield page.make_table("alternative", caption, cells, table)
+    better = -math.log(CAUTION)
+    yield page.make_table("fit.alternative", cells, table, better=better, refuted=LIMITS.refuted)
 
 
 # --- Populations and spectra ----------------------------------------------------------------------
@@ -334,12 +323,13 @@ def population_table(fit: FitView) -> Table:
         "a new member": lambda row: interval(row["new_q2.5"], row["new_q97.5"]),
         "pooling factor": column("pooling", ".2f"),
     }
+    scales = {"log": "the scale of its logarithm", "log odds": "the scale of its log odds"}
     members = {
-        each.label: f"{summary.loc[each.label, 'members']} members, {SCALES[each.scale]}"
+        each.label: f"{summary.loc[each.label, 'members']} members, "
+        f"on {scales.get(each.scale, 'its own scale')}"
         for each in populations(fit)
     }
-    caption = page.caption("fit.population")
-    return page.make_table("population", caption, cells, summary, descriptions=members)
+    return page.make_table("fit.population", cells, summary, descriptions=members)
 
 
 def member_table(fit: FitView) -> Table:
@@ -361,7 +351,7 @@ def member_table(fit: FitView) -> Table:
         "pooled share": lambda row: percent(row["shrinkage"]),
     }
     data = shrinkage(fit).loc[list(titles)]
-    return page.make_table("member", page.caption("fit.member"), cells, data, descriptions=titles)
+    return page.make_table("fit.member", cells, data, descriptions=titles)
 
 
 def _spectrum(fit: FitView) -> Iterator[page.Block]:
@@ -405,7 +395,7 @@ def discrepancy_table(fit: FitView, compared: pd.DataFrame, part: str, name: str
         "width": lambda row: percent(row["width_ratio"]),
         TRUTH: lambda row: number(row["true_value"], scale(row)),
     }
-    return fit_table(fit, name, page.caption("fit.without", part=part), cells, compared)
+    return fit_table(fit, "fit.without", cells, compared, name=name, part=part)
 
 
 # --- Readings and checks --------------------------------------------------------------------------
@@ -439,7 +429,7 @@ def check_table(checks: Mapping[str, PredictiveCheck]) -> Table:
         "readings": column("readings", ".0f"),
         "residual RMS": column("residual_rms", ".3g"),
     }
-    caption = "Residual: reading minus the noise-free prediction, in the unit of the reading."
+    key = "fit.residual"
     if any(check.pit.size for check in checks.values()):
         cells |= {f"inside {p:.0%}": _coverage_cell(p) for p in PROBABILITIES}
         cells |= {
@@ -447,8 +437,10 @@ def check_table(checks: Mapping[str, PredictiveCheck]) -> Table:
             "p": column("p_loo", ".1f"),
             "k > 0.7": column("unreliable", ".0f"),
         }
-        caption += page.caption("fit.predictive_check")
-    return page.make_table("check", caption, cells, data, label="variable", descriptions=QUANTITIES)
+        key = "fit.predictive_check"
+    return page.make_table(
+        key, cells, data, name="check", label="variable", descriptions=QUANTITIES
+    )
 
 
 def _check_numbers(check: PredictiveCheck) -> dict[str, float]:
@@ -484,7 +476,7 @@ def _convergence(fit: FitView) -> Iterator[page.Block]:
     if fit.method == "nuts":
         yield convergence_table(fit)
     if "auto" in fit.provenance:
-        yield from page.make_bullets(auto_sentences(fit.result))
+        yield from page.make_bullets(sentences_of_auto(fit.provenance))
     yield from page.make_facts(_sampler_facts(fit))
     if fit.method == "nuts" and has_draws(fit):
         yield page.picture(plots_fit.plot_ranks(fit), "fit.figure_ranks")
@@ -498,9 +490,8 @@ def convergence_table(fit: FitView) -> Table:
         "ESS tail": lambda row: or_dash(np.floor(row["ess_tail"]), ".0f"),
         "error of the mean": column("mcse_mean", ".2g"),
     }
-    caption = "Wanted: R-hat at most 1.01 and both effective sample sizes (ESS) at least 400."
     data = convergence.summary(fit)[["r_hat", "ess_bulk", "ess_tail", "mcse_mean"]]
-    return fit_table(fit, "convergence", caption, cells, data)
+    return fit_table(fit, "fit.convergence", cells, data)
 
 
 SAMPLER_FACTS: Mapping[str, tuple[str, Callable[[xr.DataArray], object]]] = {
@@ -562,13 +553,13 @@ def _effects(result: xr.DataTree) -> Iterator[page.Block]:
 def _accuracy(result: xr.DataTree) -> Iterator[page.Block]:
     """An accuracy study of the same capture, where the result holds one."""
     if "accuracy" in result.children:
-        study = accuracy_dataset(result["accuracy"].to_dataset())
+        study = accuracy_view(result["accuracy"].to_dataset())
         yield " ".join([*accuracy_sentences(study), text.reference_sentence(study)])
         yield accuracy_picture(study)
         yield study_table(study)
 
 
-def provenance_facts(provenance: Mapping[str, Any]) -> list[page.Block]:
+def provenance_facts(provenance: Provenance) -> list[page.Block]:
     """How the fit was made, in titled groups of names and values; swapped parts are marked."""
     keys = ["method", "settings", "model", "scene", "scene_parts", "seed", "precision"]
     keys += ["chain_method", "step_size_halvings", "largest_view_zenith"]
@@ -600,7 +591,7 @@ def provenance_facts(provenance: Mapping[str, Any]) -> list[page.Block]:
     ]
 
 
-def _counts(counts: Mapping[str, Any]) -> dict[str, Any]:
+def _counts(counts: Provenance) -> dict[str, Any]:
     """Numbers of readings that were fitted, masked or set aside."""
     found = {"all": counts.get("views"), "fitted": counts.get("used")}
     found |= {"masked (valid=False)": counts.get("masked")}

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,6 +13,7 @@ from matplotlib.figure import Figure
 
 from polar_bayes.diagnostics.coverage import INTERVALS, map_coverage, map_scalars
 from polar_bayes.diagnostics.parameters import Scalar
+from polar_bayes.diagnostics.view import Provenance
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.batching import IMAGE, MIN_VIEWS, Status, cut
 from polar_bayes.inference.result import provenance_of
@@ -56,11 +56,7 @@ CHECKS = {
 
 # --- Figures --------------------------------------------------------------------------------------
 
-MAX_PIXELS = 800
-"""Longest side of a figure; of larger images every second, third, ... pixel is drawn."""
-
 NO_ANSWER = "#dadada"
-APPROACH_COLORS = (NO_ANSWER, SKY, BLUE, GREEN, ORANGE, PURPLE)
 STATUS_COLORS = {
     "good": BLUE,
     "masked": NO_ANSWER,
@@ -111,15 +107,16 @@ def plot_maps(maps: xr.Dataset, *, wavelength: float | None = None) -> Figure:
         _draw_values(panel(0, at), shown[name], title, "viridis")
         _draw_values(panel(1, at), high - low, "95% width", "cividis")
     _draw_values(panel(2, 0), shown["pareto_k"], "Pareto k", "magma", limits=(0.0, 1.0))
-    _draw_flags(panel(2, 1), shown["approach"], APPROACH_COLORS)
+    _draw_flags(panel(2, 1), shown["approach"], (NO_ANSWER, SKY, BLUE, GREEN, ORANGE, PURPLE))
     status = checked_status(shown)
     colors = [STATUS_COLORS.get(each, NO_ANSWER) for each in flag_meanings(status).values()]
     _draw_flags(panel(2, 2), status, colors)
     return figure
 
 
-def _pixel_step(maps: xr.Dataset) -> int:
-    return max(1, -(-max(maps.sizes[dim] for dim in IMAGE) // MAX_PIXELS))
+def _pixel_step(maps: xr.Dataset, most: int = 800) -> int:
+    """Of images with more pixels a side every second, third, ... one is drawn."""
+    return max(1, -(-max(maps.sizes[dim] for dim in IMAGE) // most))
 
 
 def _at_wavelength(maps: xr.Dataset, wavelength: float | None) -> tuple[xr.Dataset, str]:
@@ -217,9 +214,6 @@ TRUST = ("pareto_k", "approach", "status")
 UNCHECKED = "laplace"
 """The method whose draws nothing checks in a map."""
 
-MAX_COLUMNS = 4
-"""Parameters of one figure: more would be too small to read."""
-
 
 def map_card(result: xr.Dataset) -> page.Card:
     """The card of a map."""
@@ -296,7 +290,7 @@ def _check_uncorrected(maps: xr.Dataset, truth: xr.Dataset | None, uncorrected: 
         raise FitError("it was corrected as well", where=where, hint=hint)
 
 
-def _name(maps: xr.Dataset, provenance: Mapping[str, Any], truth: xr.Dataset | None) -> str:
+def _name(maps: xr.Dataset, provenance: Provenance, truth: xr.Dataset | None) -> str:
     """The name of the capture, or of the file of the map."""
     file = Path(str(maps.encoding.get("source", "map"))).stem
     names = [text.capture_name(provenance, ""), maps.attrs.get("name")]
@@ -320,8 +314,8 @@ def _pictures(maps: xr.Dataset, scalars: Sequence[Scalar]) -> Iterator[page.Pict
     names = [name for name in dims if dims[name] <= {"wavelength"}]
     step = _pixel_step(maps)
     thinned = f" Of every {step} x {step} pixels one is drawn." if step > 1 else ""
-    for at in range(0, len(names), MAX_COLUMNS):
-        some = names[at : at + MAX_COLUMNS]
+    for at in range(0, len(names), 4):  # more columns would be too small to read
+        some = names[at : at + 4]
         spectral = [name for name in some if "wavelength" in dims[name]]
         for turn, wavelength in enumerate(_wavelengths(maps) if spectral else [None]):
             shown = some if turn == 0 else spectral
@@ -345,12 +339,10 @@ def _wavelengths(maps: xr.Dataset) -> list[float]:
 
 def _pixel_tables(counts: pd.DataFrame) -> Iterator[Table]:
     """Pixels by status; and by approach, with how many of them are good."""
-    caption = "The status of each pixel. Only good ones count in the other tables."
-    yield count_table("status", caption, counts.sum(axis=1).to_frame("pixels"), STATUSES)
-    caption = "How the numbers of each pixel were found; the cheapest method comes first."
+    yield count_table("map.status", counts.sum(axis=1).to_frame("pixels"), STATUSES)
     good = counts.loc["good"] if "good" in counts.index else 0 * counts.sum()
     data = pd.DataFrame({"pixels": counts.sum(), "good": good})
-    yield count_table("approach", caption, data, APPROACHES)
+    yield count_table("map.approach", data, APPROACHES)
 
 
 def _criticism_table(maps: xr.Dataset) -> Iterator[Table]:
@@ -358,9 +350,7 @@ def _criticism_table(maps: xr.Dataset) -> Iterator[Table]:
     data = count_criticism(maps)
     if not data.empty:
         yield page.make_table(
-            "criticism",
-            "What the readings of a pixel say against its model. A pixel with a problem is "
-            "contradicted; a caution is told next to numbers that are good otherwise.",
+            "map.criticism",
             {str(level): text.column(str(level), ",.0f") for level in data.columns},
             data,
             label="check",
@@ -369,7 +359,7 @@ def _criticism_table(maps: xr.Dataset) -> Iterator[Table]:
         )
 
 
-def count_table(name: str, caption: str, data: pd.DataFrame, meanings: Mapping[str, str]) -> Table:
+def count_table(key: str, data: pd.DataFrame, meanings: Mapping[str, str]) -> Table:
     """Counts by flag: how many there are, their share, and how many of them fulfil a condition."""
     what, *others = map(str, data.columns)
     total = int(data[what].sum())
@@ -380,9 +370,8 @@ def count_table(name: str, caption: str, data: pd.DataFrame, meanings: Mapping[s
     }
     data = data.copy()
     data.insert(1, "share", data[what] / max(total, 1))
-    return page.make_table(
-        name, caption, cells, data, label=name, descriptions=meanings, prose=[name]
-    )
+    label = key.partition(".")[2]
+    return page.make_table(key, cells, data, label=label, descriptions=meanings, prose=[label])
 
 
 def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> Table:
@@ -401,8 +390,7 @@ def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> Table:
         return lambda row: number(row[column], row["typical sd"])
 
     return page.make_table(
-        "parameter",
-        page.caption("map.parameter"),
+        "map.parameter",
         {column: cell(column) for column in columns},
         pd.DataFrame.from_dict(data, orient="index", columns=columns),
         descriptions={scalar.label: title for scalar, title in titles.items()},
@@ -418,8 +406,7 @@ def shared_table(shared: pd.DataFrame) -> Table:
         return lambda row: number(row[column], width[row.name])
 
     return page.make_table(
-        "shared",
-        page.caption("map.shared"),
+        "map.shared",
         {
             **{column: cell(column) for column in ("q2.5", "q50", "q97.5")},
             "pixels": text.column("pixels", ",.0f"),

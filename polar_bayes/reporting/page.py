@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import matplotlib
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from polar_bayes.errors import FitError, one_line
@@ -28,15 +29,6 @@ from polar_bayes.repr_html import Row, Table
 from polar_bayes.results import kind_of
 
 PAGE = "index.html"
-MARK, MARK_BYTES = b'<meta name="generator" content="polar_bayes">', 1024
-"""Every page has this mark among its first bytes."""
-
-FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""A spreadsheet runs a text that begins with one of these."""
-
-LONG_TABLE = 40
-"""Tables with more rows scroll in a box of their own."""
-
 
 type Card = tuple[list[str], Table, bool]
 """What `polar_bayes.show` has of a result: sentences, a table, and whether it may be used."""
@@ -70,23 +62,29 @@ type Cells = Mapping[str, Callable[[pd.Series], str]]
 
 
 def make_table(
-    table: str,
-    caption: str,
+    key: str,
     cells: Cells,
     data: pd.DataFrame,
     *,
+    name: str = "",
     label: str = "parameter",
     descriptions: Mapping[str, str] = {},
     groups: Mapping[str, str] = {},
     prose: Collection[str] = (),
+    **values: object,
 ) -> Table:
-    """A table with a row for each row of numbers; `label` heads the column of their names."""
+    """A table with a row for each row of numbers; `label` heads the column of their names.
+
+    The key is that of its caption, which the values fill in; the table is called after it, unless
+    it has another name.
+    """
     rows = []
-    for key, numbers in data.iterrows():
-        name = str(key[0] if isinstance(key, tuple) else key)
+    for at, numbers in data.iterrows():
+        row = str(at[0] if isinstance(at, tuple) else at)
         texts = tuple(cell(numbers) for cell in cells.values())
-        rows.append(Row(name, texts, descriptions.get(name, ""), groups.get(name, "")))
-    return Table((label, *cells), tuple(rows), prose, table, caption, data)
+        rows.append(Row(row, texts, descriptions.get(row, ""), groups.get(row, "")))
+    name = name or key.partition(".")[2]
+    return Table((label, *cells), tuple(rows), prose, name, caption(key, **values), data)
 
 
 def second_label(row: pd.Series) -> str:
@@ -180,12 +178,13 @@ def _template() -> Template:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals |= {"csv_link": csv_link, "long_table": LONG_TABLE}
+    # Tables with more rows scroll in a box of their own.
+    environment.globals |= {"csv_link": csv_link, "long_table": 40}
     return environment.get_template("page.html.j2")
 
 
 @functools.cache
-def _captions() -> dict[str, dict[str, Any]]:
+def _captions() -> dict[str, Any]:
     file = importlib.resources.files("polar_bayes.reporting") / "templates" / "captions.toml"
     return tomllib.loads(file.read_text(encoding="utf-8"))
 
@@ -204,8 +203,10 @@ def picture(
     alternative, caption = (each.format(**values) for each in _captions()[kind][name])
     buffer = io.BytesIO()
     with matplotlib.rc_context(FIXED_STYLE):
-        # No date and a fixed salt: the same result gives the same page, byte for byte.
-        figure.savefig(buffer, format="svg", dpi=160, metadata={"Date": None, "Creator": None})
+        # No date and a fixed salt: the same result gives the same page, byte for byte. `savefig`
+        # would draw a figure with a layout twice.
+        figure.dpi = 160
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
     encoded = base64.b64encode(buffer.getvalue()).decode("ascii")
     source = f"data:image/svg+xml;base64,{encoded}"
     return Picture(source, alternative, (instead or caption) + more, figure.get_figwidth() > 7.0)
@@ -256,7 +257,7 @@ def write_page(
 
 def _is_page(file: Path) -> bool:
     try:
-        return MARK in file.read_bytes()[:MARK_BYTES]
+        return b'<meta name="generator" content="polar_bayes">' in file.read_bytes()[:1024]
     except OSError:
         return False
 
@@ -271,4 +272,6 @@ def csv_link(table: pd.DataFrame, first: str) -> str:
 
 
 def _escape_formula(value: object) -> object:
-    return f"'{value}" if isinstance(value, str) and value.startswith(FORMULA) else value
+    # A spreadsheet runs a text that begins with one of these.
+    is_run = isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r"))
+    return f"'{value}" if is_run else value

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,13 +19,8 @@ from polar_bayes.reporting import style
 from polar_bayes.reporting.style import BLUE, GRAY, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 from polar_bayes.reporting.text import or_dash
 
-MAX_BINS, MIN_BINS = 20, 5
-RANKS_IN_A_BIN = 15
 MAX_INTERVALS = 200
 """Simulations whose intervals are drawn: more would hide each other."""
-
-LOGARITHMIC = 50.0
-"""Truths that span a larger factor are drawn on a logarithmic axis."""
 
 MAX_ROWS = 6
 METHOD_COLORS = (ORANGE, GREEN, PURPLE, SKY)
@@ -125,7 +119,7 @@ def histogram_panel(axes: Axes, ranks: Ranks) -> None:
     if count < 2:
         _too_few(axes)
         return
-    bins = int(np.clip(count // RANKS_IN_A_BIN, MIN_BINS, MAX_BINS))
+    bins = int(np.clip(count // 15, 5, 20))
     low, high = histogram_band(count, bins)
     axes.axhspan(low, high, color=style.lighten(GRAY, 0.75), lw=0)
     axes.axhline(1.0, color=GRAY, lw=0.8, ls="--")
@@ -155,7 +149,7 @@ def estimate_panel(axes: Axes, ranks: Ranks) -> None:
     # Of both axes: all truths and means, whatever the longest intervals reach.
     values = np.concatenate([truth[np.isfinite(truth)], mean[answered]])
     values = values if values.size else np.array([0.0, 1.0])
-    is_log = bool(values.min() > 0.0 and values.max() / values.min() > LOGARITHMIC)
+    is_log = bool(values.min() > 0.0 and values.max() / values.min() > 50.0)
     if is_log:
         limits = float(values.min()) / 1.2, float(values.max()) * 1.2
         axes.set(xscale="log", yscale="log")
@@ -167,7 +161,7 @@ def estimate_panel(axes: Axes, ranks: Ranks) -> None:
     axes.set(xlim=limits, ylim=limits)
     failed = truth[~answered]
     if failed.size:
-        below: Any = {"transform": axes.get_xaxis_transform(), "clip_on": False, "zorder": 6}
+        below: style.Look = {"transform": axes.get_xaxis_transform(), "clip_on": False, "zorder": 6}
         axes.plot(failed, 0.0 * failed, "x", color=VERMILLION, ms=4, mew=1, **below)
 
 
@@ -216,7 +210,6 @@ def plot_calibration(
         right.set_ylabel("posterior mean", fontsize=8)
     for axes, label in zip(panels[-3:], (*2 * ("rank of the truth",), "truth"), strict=True):
         axes.set_xlabel(label, fontsize=8)
-    style.set_tick_style(panels)
     return figure
 
 
@@ -271,7 +264,6 @@ def interval_coverage(
     ticks = [each / 100.0 for each in (*range(0, 50, 10), *INTERVALS) if each / 100.0 > least]
     axes.set_xticks(ticks, [f"{tick:.0%}" for tick in ticks])
     axes.set_xlabel("share of all fits whose interval holds the truth", fontsize=9)
-    style.set_tick_style(axes)
     _name_methods(figure, method, colors)
     return figure
 
@@ -304,9 +296,8 @@ def _panels(
     for axes, each in zip(panels, ranks, strict=True):
         style.set_panel_title(axes, each.title)
         draw(axes, each)
-    style.set_tick_style(panels)
-    figure.supxlabel(labels[0], fontsize=9)
-    figure.supylabel(labels[1], fontsize=9)
+    figure.supxlabel(labels[0])
+    figure.supylabel(labels[1])
     return figure
 
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -24,7 +23,6 @@ LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
 
 # --- Readings against view zenith -----------------------------------------------------------------
 
-MAX_AZIMUTHS = 4
 MAX_ROWS = 6
 COLUMNS = 3
 
@@ -45,6 +43,7 @@ def _missing(result: xr.DataTree, name: str) -> str:
     return "" if result["observed_data"].to_dataset()[name].sizes.get("view") else "view"
 
 
+@once
 def curves(fit: FitView, name: str) -> list[xr.Dataset]:
     """One recorded variable and its prediction by view, for each material and wavelength."""
     result = fit.result
@@ -160,7 +159,6 @@ def _draw_readings(fit: FitView, found: list[xr.Dataset], label: str, short_labe
     drawn: set[str] = set()
     for axes, curve in panels:
         drawn |= _draw_curve(axes, curve, limit)
-    style.set_tick_style(figure.axes)
     zenith = np.concatenate([curve["zenith"] for curve in found])
     zenith = zenith[np.isfinite(zenith)]
     low, high = (float(zenith.min()), float(zenith.max())) if zenith.size else (0.0, 90.0)
@@ -169,7 +167,7 @@ def _draw_readings(fit: FitView, found: list[xr.Dataset], label: str, short_labe
     where = f", {_azimuth_title(azimuths[0])}" if len(azimuths) == 1 else ""
     # Not as a title: there the legend would cover it.
     part = f" (the first {len(shown)} of {len(found)})" if len(found) > len(shown) else ""
-    figure.supxlabel(f"view zenith [degree]{where}{part}", fontsize=9)
+    figure.supxlabel(f"view zenith [degree]{where}{part}")
     handles = [handle for key, handle in _reading_handles().items() if key in drawn]
     style.add_legend(figure, handles, columns=4 if figure.get_figwidth() > 7.0 else 3)
     return figure
@@ -215,11 +213,11 @@ def _panels_by_curve(shown: list[xr.Dataset], label: str) -> tuple[Figure, Panel
     return figure, panels
 
 
-def _azimuths(found: list[xr.Dataset]) -> list[float]:
+def _azimuths(found: list[xr.Dataset], most: int = 4) -> list[float]:
     """The distinct azimuths between view and light, to the degree; none if there are many."""
     azimuths = np.concatenate([curve["azimuth"] for curve in found])
     distinct = sorted(set(np.round(azimuths[np.isfinite(azimuths)])), reverse=True)
-    return [float(each) for each in distinct] if len(distinct) <= MAX_AZIMUTHS else []
+    return [float(each) for each in distinct] if len(distinct) <= most else []
 
 
 def _azimuth_title(azimuth: float) -> str:
@@ -254,7 +252,7 @@ def _draw_prediction(axes: Axes, curve: xr.Dataset) -> set[str]:
     if not zenith.size:
         return set()
     is_smooth = _is_smooth(curve)
-    line: dict[str, Any] = {"marker": "_", "ms": 7, "mew": 1.4, "ls": ""}
+    line: style.Look = {"marker": "_", "ms": 7, "mew": 1.4, "ls": ""}
     line = {"lw": 1.4} if is_smooth else line
     axes.plot(zenith, curve["center"].to_numpy(), color=BLUE, zorder=3, **line)
     # Where a reading is missing, so may be its error: the scatter there is not known.
@@ -272,7 +270,7 @@ def _draw_prediction(axes: Axes, curve: xr.Dataset) -> set[str]:
     return {"median", "half", "most"}
 
 
-def _reading_markers() -> dict[str, dict[str, Any]]:
+def _reading_markers() -> dict[str, style.Look]:
     edge = {"mec": style.text_color(), "mew": 0.5}
     return {
         "reading": {"ls": "none", "marker": "o", "ms": 3.4, "color": style.text_color()},
@@ -296,9 +294,7 @@ def _reading_handles() -> dict[str, Artist]:
 # --- Parameters against wavelength ----------------------------------------------------------------
 
 MAX_MEMBERS = 12
-MAX_DRAWS = 1000
 FINE = 61
-BEYOND = 0.05
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -333,7 +329,7 @@ def spectra(fit: FitView) -> dict[str, list[Spectrum]]:
         return {}
     wavelengths = fit.posterior["wavelength"].to_numpy().astype(float)
     low, high = wavelengths.min(), wavelengths.max()
-    beyond = min(BEYOND * (high - low), 0.5 * low)
+    beyond = min(0.05 * (high - low), 0.5 * low)
     between = np.union1d(np.linspace(low - beyond, high + beyond, FINE), wavelengths)
     bands = _bands(fit, between)
     return {
@@ -357,7 +353,7 @@ def _can_be_drawn(members: Mapping[str, Sequence[Scalar]]) -> bool:
 def _bands(fit: FitView, between: np.ndarray) -> dict[str, dict[int, np.ndarray]]:
     """Quantiles between the measured wavelengths, by parameter and number of the member."""
     result, posterior = fit.result, fit.posterior
-    step = max(1, posterior.sizes["chain"] * posterior.sizes["draw"] // MAX_DRAWS)
+    step = max(1, posterior.sizes["chain"] * posterior.sizes["draw"] // 1000)
     chosen = {"draw": slice(None, None, step)}
     lead = [str(d) for d in posterior.dims if d in ("patch", "material")]
     if len(lead) == 1:
@@ -404,15 +400,12 @@ def _spectrum(
 
 
 @style.styled
-def plot_spectrum(
-    result: xr.DataTree | FitView, name: str, found: dict[str, list[Spectrum]] | None = None
-) -> Figure:
+def plot_spectrum(result: xr.DataTree | FitView, name: str) -> Figure:
     """One parameter over wavelength: median, 50% and 95%, a panel for each member.
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
         name: The parameter, such as refractive_index.
-        found: That of `spectra(result)`, where it is there already.
 
     Returns:
         The figure: bands between and beyond the measured wavelengths where the fit ties colors
@@ -422,7 +415,7 @@ def plot_spectrum(
         FitError: The fit does not have that parameter over wavelength.
     """
     fit = view_of(result)
-    found = spectra(fit) if found is None else found
+    found = spectra(fit)
     if name not in found:
         hint = f"choose one of {', '.join(found) or 'none'}"
         what = f"{name} was not fitted over wavelength"
@@ -431,7 +424,7 @@ def plot_spectrum(
     several = len(shown) > 1
     width, height = (8.2, 1.9) if several else (6.6, 2.9)
     columns = 3 if len(shown) != 4 else 2
-    size: dict[str, Any] = {"width": width, "panel_height": height, "header": 0.8}
+    size: style.Look = {"width": width, "panel_height": height, "header": 0.8}
     figure, panels = style.grid(len(shown), columns=columns, **size)
     for axes, each in zip(panels, shown, strict=True):
         _draw_spectrum(axes, each)
@@ -441,12 +434,11 @@ def plot_spectrum(
     for axes in panels:
         axes.set_ylim(low, high)
         axes.locator_params(axis="x", nbins=5)
-    style.set_tick_style(panels)
     sizes = fit.posterior[name].sizes
     total = np.prod([sizes[dim] for dim in sizes if dim not in (*SAMPLE_DIMS, "wavelength")])
     part = f" (the first {len(shown)} of {int(total)})" if total > len(shown) else ""
-    figure.supxlabel(f"wavelength [nm]{part}", fontsize=9)
-    figure.supylabel(shown[0].label, fontsize=9)
+    figure.supxlabel(f"wavelength [nm]{part}")
+    figure.supylabel(shown[0].label)
     style.add_legend(figure, _spectrum_handles(shown), columns=5)
     return figure
 
@@ -463,7 +455,7 @@ def _draw_spectrum(axes: Axes, each: Spectrum) -> None:
     else:
         axes.vlines(each.measured, each.levels[0], each.levels[4], color=BLUE, lw=1.1)
         axes.vlines(each.measured, each.levels[1], each.levels[3], color=BLUE, lw=3.6)
-        ring: dict[str, Any] = {"mfc": style.background(), "mec": BLUE, "ms": 4.5}
+        ring: style.Look = {"mfc": style.background(), "mec": BLUE, "ms": 4.5}
         axes.plot(each.measured, each.levels[2], "o", ls="", **ring)
         margin = 0.08 * np.ptp(each.measured)
         limits = each.measured[[0, -1]] + [-margin, margin]
@@ -474,8 +466,8 @@ def _draw_spectrum(axes: Axes, each: Spectrum) -> None:
 
 
 def _spectrum_handles(shown: Sequence[Spectrum]) -> list[Artist]:
-    dashes: dict[str, Any] = {"color": lighten(GRAY, 0.6), "lw": 0.9, "ls": (0, (2, 2))}
-    ring: dict[str, Any] = {"marker": "o", "mfc": style.background(), "ls": ""}
+    dashes: style.Look = {"color": lighten(GRAY, 0.6), "lw": 0.9, "ls": (0, (2, 2))}
+    ring: style.Look = {"marker": "o", "mfc": style.background(), "ls": ""}
     handles: list[Artist] = [
         Line2D([], [], color=BLUE, label="posterior median", **ring),
         Line2D([], [], color=BLUE, lw=3.6, label="50%"),

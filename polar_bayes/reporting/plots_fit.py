@@ -1,7 +1,7 @@
 """Figures of a fit: its parameters, its checks, and the members of its populations."""
 
 import functools
-from typing import Any
+import itertools
 
 import numpy as np
 import pandas as pd
@@ -10,6 +10,7 @@ from arviz_stats.base import array_stats
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.gridspec import SubplotSpec
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator
@@ -21,7 +22,7 @@ from polar_bayes.diagnostics.population import (
     populations,
     shrinkage,
 )
-from polar_bayes.diagnostics.predictive import PredictiveCheck, pit_band, predictive_checks
+from polar_bayes.diagnostics.predictive import pit_band, predictive_checks
 from polar_bayes.diagnostics.view import FitView, once, view_of
 from polar_bayes.errors import FitError
 from polar_bayes.reporting import style
@@ -37,11 +38,6 @@ from polar_bayes.reporting.style import (
     lighten,
     parameter_title,
 )
-
-MAX_PAIRED = 8
-MAX_POINTS = 800
-RANK_BINS = 20
-MINUS = "\N{MINUS SIGN}"
 
 
 @once
@@ -80,43 +76,49 @@ def plot_pairs(result: xr.DataTree | FitView) -> Figure:
     fit = view_of(result)
     found = drawable(fit, material=True)
     found = [s for s in found if _first_material_first(s) == _first_material_first(found[0])]
-    found = found[:MAX_PAIRED]
+    found = found[:8]
     if len(found) < 2:
         raise _nothing_to_draw("plot_pairs", "two material parameters with draws")
     titles = [parameter_title(scalar, fit.posterior).split(", ") for scalar in found]
     labels = ["\n".join(style.wrap(part, 19) for part in title) for title in titles]
     size = len(found)
-    figure, panels = _pair_panels(size, lines=max(label.count("\n") for label in labels) + 1)
+    lines = max(label.count("\n") for label in labels) + 1
+    # Placed by hand: a layout engine takes seconds for this many axes.
+    side, margin = max(5.6, min(1.35 * size + 0.9, 9.6)), 0.42 + 0.16 * lines
+    figure = style.NotebookFigure(figsize=(side, side))
+    places = figure.add_gridspec(
+        *(size, size), left=(margin + 0.25) / side, bottom=margin / side, right=0.985, top=0.99,
+        hspace=0.12, wspace=0.12,
+    )  # fmt: skip
     draws = np.stack([scalar.draws.ravel() for scalar in found])
-    shown = np.linspace(0, draws.shape[1] - 1, min(MAX_POINTS, draws.shape[1])).astype(int)
+    shown = np.linspace(0, draws.shape[1] - 1, min(800, draws.shape[1])).astype(int)
     diverging = np.flatnonzero(np.asarray(fit.stats.get("diverging", np.empty(0))))
     correlation = np.corrcoef(draws)
     limits = [style.padded_range(values, 0.04) for values in draws]
     truths = [fit.truth(scalar) for scalar in found]
-    for row in range(size):
-        for column in range(size):
-            axes = panels[row, column]
-            axes.set_xlim(limits[column])
-            if row == column:
-                counts, edges = np.histogram(draws[row], 30, range=limits[row])
-                axes.stairs(counts, edges, fill=True, color=lighten(BLUE, 0.45))
-                axes.set_ylim(0, 1.08 * counts.max())
-                _draw_truth(axes, truths[row], np.nan)
-            elif row > column:
-                axes.set_ylim(limits[row])
-                xy = draws[[column, row]]
-                axes.plot(*xy[:, shown], "o", color=BLUE, ms=1.6, mew=0, alpha=0.4, rasterized=True)
-                if diverging.size:
-                    cross: dict[str, Any] = {"color": VERMILLION, "ms": 4, "mew": 1.2}
-                    axes.plot(*xy[:, diverging], "x", rasterized=True, **cross)
-                _draw_truth(axes, truths[column], truths[row])
-            else:
-                _write_correlation(axes, correlation[row, column])
-            _pair_ticks(axes, row, column, size)
-        panels[-1, row].set_xlabel(labels[row], fontsize=8)
-        if row:
-            panels[row, 0].set_ylabel(labels[row], fontsize=8)
-    panels[0, 0].set_ylabel("share of draws", fontsize=8)
+    for row, column in itertools.combinations(range(size), 2):
+        _write_correlation(figure, places[row, column], correlation[row, column])
+    for row, column in ((at, other) for at in range(size) for other in range(at + 1)):
+        axes = figure.add_subplot(places[row, column])
+        axes.set_xlim(limits[column])
+        if row == column:
+            counts, edges = np.histogram(draws[row], 30, range=limits[row])
+            axes.stairs(counts, edges, fill=True, color=lighten(BLUE, 0.45))
+            axes.set_ylim(0, 1.08 * counts.max())
+            _draw_truth(axes, truths[row], np.nan)
+        else:
+            axes.set_ylim(limits[row])
+            xy = draws[[column, row]]
+            axes.plot(*xy[:, shown], "o", color=BLUE, ms=1.6, mew=0, alpha=0.4, rasterized=True)
+            if diverging.size:
+                cross: style.Look = {"color": VERMILLION, "ms": 4, "mew": 1.2}
+                axes.plot(*xy[:, diverging], "x", rasterized=True, **cross)
+            _draw_truth(axes, truths[column], truths[row])
+        _pair_ticks(axes, row, column, size)
+        if row == size - 1:
+            axes.set_xlabel(labels[column], fontsize=8)
+        if column == 0:
+            axes.set_ylabel(labels[row] if row else "share of draws", fontsize=8)
     figure.align_labels()
     return figure
 
@@ -143,19 +145,18 @@ def plot_ranks(result: xr.DataTree | FitView) -> Figure:
     found = [found[i] for i in worst]
     figure, panels = style.grid(len(found), panel_height=1.35, header=0.5)
     chains, length = found[0].draws.shape
-    edges = np.linspace(0.0, 1.0, RANK_BINS + 1)
+    edges = np.linspace(0.0, 1.0, 21)
     for axes, scalar in zip(panels, found, strict=True):
         order = np.argsort(np.argsort(scalar.draws.ravel(), kind="stable")) / scalar.draws.size
         for chain, own in enumerate(order.reshape(chains, length)):
-            share = np.histogram(own, edges)[0] * RANK_BINS / length
+            share = np.histogram(own, edges)[0] * (len(edges) - 1) / length
             color = CHAIN_COLORS[chain % len(CHAIN_COLORS)]
             axes.stairs(share, edges, color=color, lw=1.1, baseline=None)
         axes.axhline(1.0, color=GRAY, lw=0.8, ls="--")
         axes.set(xlim=(0, 1), ylim=(0, max(2.0, axes.get_ylim()[1])), xticks=[0, 0.5, 1])
         style.set_panel_title(axes, parameter_title(scalar, fit.posterior))
-    style.set_tick_style(panels)
-    figure.supxlabel("rank among the draws of all chains (0 lowest, 1 highest)", fontsize=9)
-    figure.supylabel("density", fontsize=9)
+    figure.supxlabel("rank among the draws of all chains (0 lowest, 1 highest)")
+    figure.supylabel("density")
     handles = [
         Line2D([], [], color=color, label=f"chain {i + 1}")
         for i, color in enumerate(CHAIN_COLORS[:chains])
@@ -207,7 +208,6 @@ def plot_prior_posterior(result: xr.DataTree | FitView) -> Figure:
         axes.spines["left"].set_visible(False)
         axes.locator_params(axis="x", nbins=5)
         style.set_panel_title(axes, parameter_title(scalar, fit.posterior))
-    style.set_tick_style(panels)
     handles: list[Patch | Line2D] = [
         Patch(color=lighten(GRAY, 0.72), label="prior"),
         Patch(color=lighten(BLUE, 0.45), label="posterior"),
@@ -220,14 +220,11 @@ def plot_prior_posterior(result: xr.DataTree | FitView) -> Figure:
 
 
 @style.styled
-def plot_pit(
-    result: xr.DataTree | FitView, checks: dict[str, PredictiveCheck] | None = None
-) -> Figure:
+def plot_pit(result: xr.DataTree | FitView) -> Figure:
     """PIT and leave-one-out PIT of every variable: distance from the uniform distribution.
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
-        checks: Those of `predictive_checks(result)`, where they are there already.
 
     Returns:
         The figure: a row for each variable, bands that hold the whole curve with 95%.
@@ -235,8 +232,7 @@ def plot_pit(
     Raises:
         FitError: No variable has two readings and enough draws.
     """
-    checks = predictive_checks(result) if checks is None else checks
-    rows = [check for check in checks.values() if check.pit.size >= 2]
+    rows = [check for check in predictive_checks(result).values() if check.pit.size >= 2]
     if not rows:
         raise _nothing_to_draw("plot_pit", "two readings and 100 draws")
     figure = style.NotebookFigure(figsize=(8.2, 2.1 * len(rows) + 0.5), layout="constrained")
@@ -247,21 +243,8 @@ def plot_pit(
             _pit_panel(axes, values)
             axes.set_title(f"{QUANTITIES.get(check.name, check.name)}: {kind}", loc="left")
         panels[row, 0].set_ylabel("share below, minus uniform")
-    style.set_tick_style(list(panels.flat))
-    figure.supxlabel("PIT: share of the prediction below the reading", fontsize=9)
+    figure.supxlabel("PIT: share of the prediction below the reading")
     return figure
-
-
-def _pair_panels(size: int, *, lines: int) -> tuple[Figure, np.ndarray]:
-    """Panels for pairs, placed by hand: a layout engine takes seconds for this many axes."""
-    side = max(5.6, min(1.35 * size + 0.9, 9.6))
-    margin = 0.42 + 0.16 * lines
-    figure = style.NotebookFigure(figsize=(side, side))
-    place = {"left": (margin + 0.25) / side, "bottom": margin / side, "right": 0.985, "top": 0.99}
-    panels = figure.subplots(
-        size, size, squeeze=False, gridspec_kw={**place, "hspace": 0.12, "wspace": 0.12}
-    )
-    return figure, panels
 
 
 def _pit_panel(axes: Axes, values: np.ndarray | None) -> None:
@@ -286,26 +269,19 @@ def _scaled_histogram(
 
 
 def _draw_truth(axes: Axes, x: float, y: float) -> None:
-    line: dict[str, Any] = {"color": ORANGE, "lw": 1.2, "ls": "--", "zorder": 3}
+    line: style.Look = {"color": ORANGE, "lw": 1.2, "ls": "--", "zorder": 3}
     if np.isfinite(x):
         axes.axvline(x, **line)
     if np.isfinite(y):
         axes.axhline(y, **line)
 
 
-def _write_correlation(axes: Axes, value: float) -> None:
-    axes.axis("off")
-    strength = min(abs(value), 1.0)
-    axes.text(
-        0.5,
-        0.5,
-        "0.00" if abs(value) < 0.005 else f"{value:+.2f}".replace("-", MINUS),
-        ha="center",
-        va="center",
-        transform=axes.transAxes,
-        fontsize=8.0 + 3.0 * strength,
-        color=style.text_color() if strength > 0.3 else GRAY,
-    )
+def _write_correlation(figure: Figure, place: SubplotSpec, value: float) -> None:
+    strength, box = min(abs(value), 1.0), place.get_position(figure)
+    text = "0.00" if abs(value) < 0.005 else f"{value:+.2f}".replace("-", "\N{MINUS SIGN}")
+    color = style.text_color() if strength > 0.3 else GRAY
+    at = (box.x0 + box.x1) / 2.0, (box.y0 + box.y1) / 2.0
+    figure.text(*at, text, ha="center", va="center", fontsize=8.0 + 3.0 * strength, color=color)
 
 
 def _pair_ticks(axes: Axes, row: int, column: int, size: int) -> None:
@@ -324,34 +300,15 @@ def _nothing_to_draw(what: str, needed: str) -> FitError:
 # --- Shrinkage: members of a population without and with pooling ----------------------------------
 
 MAX_MEMBERS = 60
-MANY_MEMBERS = 30
-"""With more members rows are lower and labels smaller."""
-
-ROW_HEIGHT, LOW_ROW_HEIGHT = 0.24, 0.17
-OFFSET = 0.17
-"""The estimate alone is drawn above the middle of a row, the pooled one below, unit row."""
-
-REACH = 1.2
-"""How far the axis extends to estimates alone, in widths of the pooled range."""
-
-LOGARITHMIC = 15.0
-"""From this ratio of largest to smallest value on, a positive parameter has a log axis."""
 
 
 @style.styled
-def plot_shrinkage(
-    result: xr.DataTree | FitView,
-    label: str,
-    summary: pd.DataFrame | None = None,
-    members: pd.DataFrame | None = None,
-) -> Figure:
+def plot_shrinkage(result: xr.DataTree | FitView, label: str) -> Figure:
     """Every member of one population: alone (hollow), pooled (filled), and the population.
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
         label: Of the population, such as `refractive_index` or `refractive_index[450]`.
-        summary: That of `population_summary`, where it is there already.
-        members: That of `shrinkage`, where it is there already.
 
     Returns:
         The figure: members sorted by their pooled mean, at most 60, taken evenly.
@@ -360,8 +317,7 @@ def plot_shrinkage(
         FitError: The result has no such population, or its draws are not finite.
     """
     fit = view_of(result)
-    summary = population_summary(fit) if summary is None else summary
-    members = shrinkage(fit) if members is None else members
+    summary, members = population_summary(fit), shrinkage(fit)
     found = {each.label: each for each in populations(fit)}
     if label not in found or label not in summary.index:
         hint = f"choose one of {', '.join(summary.index) or 'none'}"
@@ -378,8 +334,8 @@ def plot_shrinkage(
     count = len(rows)
     chosen = np.linspace(0, count - 1, min(count, MAX_MEMBERS)).astype(int)
     rows = rows.iloc[chosen].reset_index(drop=True)
-    is_dense = len(rows) > MANY_MEMBERS
-    height = (LOW_ROW_HEIGHT if is_dense else ROW_HEIGHT) * len(rows)
+    is_dense = len(rows) > 30
+    height = (0.17 if is_dense else 0.24) * len(rows)
     figure = style.NotebookFigure(figsize=(7.0, max(height, 0.7) + 1.5), layout="constrained")
     axes = figure.subplots()
     axes.set_xlim(_shrinkage_limits(axes, population, whole, rows))
@@ -396,7 +352,6 @@ def plot_shrinkage(
     names += map(style.label_text, style.coordinate_labels(population.location))
     part = f" ({len(rows)} of {count}, evenly from low to high)" if count > len(rows) else ""
     axes.set_xlabel(", ".join(names) + part)
-    style.set_tick_style(axes)
     axes.tick_params(axis="y", length=0, labelsize=6.0 if is_dense else 7.5)
     style.add_legend(figure, _shrinkage_legend(rows), columns=2)
     return figure
@@ -420,9 +375,7 @@ def _shrinkage_limits(
         [rows[["q2.5", "q97.5"]].to_numpy().ravel(), whole[["new_q2.5", "new_q97.5"]]]
     ).astype(float)
     is_log = bool(
-        population.scale == "log"
-        and pooled.min() > 0
-        and np.ptp(np.log(pooled)) > np.log(LOGARITHMIC)
+        population.scale == "log" and pooled.min() > 0 and np.ptp(np.log(pooled)) > np.log(15.0)
     )
     if is_log:
         axes.set_xscale("log")
@@ -434,16 +387,15 @@ def _shrinkage_limits(
     # A log axis has no values below zero: estimates alone that reach there are drawn at its end.
     with np.errstate(all="ignore"):
         others = forward(rows[["true", "unpooled", "unpooled_q2.5", "unpooled_q97.5"]].to_numpy())
-    near = np.clip(
-        others[np.isfinite(others)], pooled.min() - REACH * width, pooled.max() + REACH * width
-    )
+    reach = 1.2 * width
+    near = np.clip(others[np.isfinite(others)], pooled.min() - reach, pooled.max() + reach)
     low, high = style.padded_range(np.concatenate([pooled, near]), 0.03)
     return float(inverse(low)), float(inverse(high))
 
 
 def _draw_member(axes: Axes, at: float, row: pd.Series, *, size: float) -> None:
     low, high = axes.get_xlim()
-    above, below = at + OFFSET, at - OFFSET
+    above, below = at + 0.17, at - 0.17  # alone and pooled
     faint = lighten(PURPLE, 0.25)
     if np.isfinite(row["unpooled"]):
         seen = float(np.clip(row["unpooled"], low, high))
@@ -462,7 +414,7 @@ def _draw_member(axes: Axes, at: float, row: pd.Series, *, size: float) -> None:
         axes.plot([row["true"]], [below], zorder=6, **truth)
 
 
-def _hollow() -> dict[str, Any]:
+def _hollow() -> style.Look:
     """Marker of an estimate without pooling."""
     return {"mfc": style.background(), "mec": PURPLE, "mew": 1.1, "ms": 5}
 

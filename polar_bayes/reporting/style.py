@@ -11,7 +11,7 @@ import io
 import math
 import textwrap
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, override
 
 import matplotlib
 import matplotlib.style
@@ -20,6 +20,7 @@ import xarray as xr
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
+from matplotlib.backend_bases import RendererBase
 from matplotlib.figure import Figure
 from matplotlib.font_manager import findfont, get_font
 from matplotlib.lines import Line2D
@@ -49,6 +50,9 @@ STYLE: Any = {
     "axes.edgecolor": GRAY,
     "xtick.color": GRAY,
     "ytick.color": GRAY,
+    "xtick.major.size": 3.0,
+    "ytick.major.size": 3.0,
+    "figure.labelsize": 9.0,
 }
 """Defaults of this package, each replaced by a setting of the user."""
 
@@ -70,6 +74,10 @@ QUANTITIES = {
     "intensity": "intensity",
 }
 SHORT = {**QUANTITIES, "dop": "DoP", "q": "q", "u": "u"}
+
+
+type Look = dict[str, Any]
+"""Keyword arguments of matplotlib."""
 
 
 def styled[**P, R](draw: Callable[P, R]) -> Callable[P, R]:
@@ -98,7 +106,7 @@ def _settings() -> Any:
     own: Any = matplotlib.rcParams
     default: Any = matplotlib.rcParamsDefault
     wanted = {**STYLE, **dict.fromkeys(("xtick.labelcolor", "ytick.labelcolor"), own["text.color"])}
-    unset = {key: value for key, value in wanted.items() if own[key] == default[key]}
+    unset = {key: value if own[key] == default[key] else own[key] for key, value in wanted.items()}
     families = own["font.family"]
     # DejaVu Sans comes last, so that every letter of a name can be drawn.
     fonts = [*([] if families == default["font.family"] else families), "DejaVu Sans"]
@@ -126,7 +134,17 @@ def lighten(color: str, share: float) -> tuple[float, float, float]:
 
 
 class NotebookFigure(Figure):
-    """A figure that a notebook shows without pyplot."""
+    """A figure that a notebook shows without pyplot, drawn in the style that it was made in."""
+
+    def __init__(self, *args: Any, **settings: Any) -> None:
+        super().__init__(*args, **settings)
+        self._style = {key: matplotlib.rcParams[key] for key in _settings()}
+
+    @override
+    def draw(self, renderer: RendererBase) -> None:
+        # matplotlib looks up the looks of ticks only now.
+        with matplotlib.rc_context(self._style):
+            super().draw(renderer)
 
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
@@ -147,12 +165,6 @@ def grid(
 def add_legend(figure: Figure, handles: Iterable[Artist], columns: int) -> None:
     """A legend above the panels."""
     figure.legend(handles=list(handles), loc="outside upper left", ncols=columns, frameon=False)
-
-
-def set_tick_style(axes: Axes | Iterable[Axes]) -> None:
-    """Fix tick sizes now: matplotlib would look them up only when the figure is drawn."""
-    for each in [axes] if isinstance(axes, Axes) else axes:
-        each.tick_params(labelsize=matplotlib.rcParams["xtick.labelsize"], length=3.0, color=GRAY)
 
 
 def set_panel_title(axes: Axes, title: str) -> None:
@@ -179,7 +191,7 @@ def write_in_panel(axes: Axes, text: str) -> None:
     axes.text(0.5, 0.5, text, ha="center", transform=axes.transAxes, color=GRAY)
 
 
-def true_value_style() -> dict[str, Any]:
+def true_value_style() -> Look:
     """Marker of a true value."""
     return {"marker": "d", "ls": "", "mfc": ORANGE, "mec": background(), "ms": 6.5}
 

@@ -7,24 +7,24 @@ fits, maps, calibrations and accuracy studies. Tables and captions belong to the
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
-from polar_bayes.benchmark.advice import accuracy_dataset
+from polar_bayes.benchmark.advice import Study, accuracy_view
 from polar_bayes.calibration.scores import is_calibrated, p_values, significance_level
 from polar_bayes.calibration.verdict import CalibrationView, calibration_verdict
 from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.compare import FitComparison
 from polar_bayes.diagnostics.convergence import Verdict
 from polar_bayes.diagnostics.criticism import criticize
+from polar_bayes.diagnostics.finding import join
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.diagnostics.population import Population, population_summary, populations
 from polar_bayes.diagnostics.predictive import predictive_checks
 from polar_bayes.diagnostics.sensitivity import sensitivity
-from polar_bayes.diagnostics.view import FitView
+from polar_bayes.diagnostics.view import FitView, Provenance
 from polar_bayes.errors import one_line
 from polar_bayes.inference.batching import MIN_VIEWS
 from polar_bayes.methods.registry import METHODS
@@ -35,9 +35,6 @@ from polar_bayes.results import MIN_GOOD_SHARE, verdict
 # --- Numbers as text, with the digits that they deserve -------------------------------------------
 
 DASH = "\N{EN DASH}"
-SEVERAL = 4
-"""Of more entries a sentence tells the range."""
-
 MAX_NAMED = 6
 """Longer lists of names end with `and 3 more`."""
 
@@ -113,18 +110,13 @@ def p_value(level: float) -> Callable[[pd.Series], str]:
     return cell
 
 
-def join(names: Sequence[str]) -> str:
-    """`a, b and c`."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-
-
 def join_first(names: Sequence[str]) -> str:
     """The first names of many: `a, b and 3 more`."""
     more = len(names) - MAX_NAMED
     return join([*names[:MAX_NAMED], *([f"{more} more"] if more > 0 else [])])
 
 
-def capture_name(provenance: Mapping[str, Any], default: str = "capture") -> str:
+def capture_name(provenance: Provenance, default: str = "capture") -> str:
     """The name of the capture that a result is of."""
     capture = provenance.get("capture")
     name = capture.get("name") if isinstance(capture, Mapping) else capture
@@ -133,10 +125,7 @@ def capture_name(provenance: Mapping[str, Any], default: str = "capture") -> str
 
 # --- Fits -----------------------------------------------------------------------------------------
 
-# Two intervals whose widths differ by less than this are equally wide, as far as draws can tell.
-EQUAL_WIDTHS = 0.05
 PLURALS = {"patch": "patches", "material": "materials"}
-HALF = 0.5
 
 HELD, PRIOR = " held fixed", "prior of "
 
@@ -155,7 +144,7 @@ def fit_headline(fit: FitView) -> str:
     return f"{name} {passed}." + (" Mind the cautions." if verdict.cautions else "")
 
 
-def made_by(provenance: Mapping[str, Any], method: str) -> str:
+def made_by(provenance: Provenance, method: str) -> str:
     """Scene, model, method and seed in one line."""
     parts = {
         key: f"{key} {one_line(str(provenance[key]))}"
@@ -167,7 +156,7 @@ def made_by(provenance: Mapping[str, Any], method: str) -> str:
     return f"{text[:1].upper()}{text[1:]}."
 
 
-def swapped_sentence(provenance: Mapping[str, Any]) -> str:
+def swapped_sentence(provenance: Provenance) -> str:
     """What the user replaced, in one sentence."""
     if "swapped" not in provenance:
         return ""
@@ -244,7 +233,7 @@ def pooling(fit: FitView) -> list[str]:
         if np.isfinite(factor):
             names = [short_title(each.members[0], fit.posterior), *coordinate_labels(each.location)]
             name = f"{', '.join(names)} ({factor:.2f})"
-            groups.setdefault(bool(factor > HALF), []).append(name)
+            groups.setdefault(bool(factor > 0.5), []).append(name)
     phrases = {
         True: "For {} the population says more than the readings of a single member (pooling "
         "factor in brackets): quote such estimates as those of a member of this population.",
@@ -289,7 +278,7 @@ def predictive_sentences(fit: FitView) -> list[str]:
             effect = (
                 "leave-one-out cannot be approximated with these draws, so its results on this "
                 "page mean little."
-                if each.loo.unreliable > HALF * each.count
+                if 2 * each.loo.unreliable > each.count
                 else "they are so influential that leave-one-out cannot be approximated for them. "
                 "Inspect them first."
             )
@@ -307,7 +296,7 @@ def index_sentences(fit: FitView) -> list[str]:
         return []
     rows = convergence.summary(fit).loc[[scalar.label for scalar in found]]
     ends = [interval(row["q2.5"], row["q97.5"]) for _, row in rows.iterrows()]
-    if len(found) > SEVERAL:
+    if len(found) > 4:
         low, high = numbers([rows["mean"].min(), rows["mean"].max()], rows["sd"].median())
         return [
             f"The refractive index n of {len(found)} entries lies between {low} and {high}; the "
@@ -370,8 +359,9 @@ def overconfidence(fit: FitView, compared: pd.DataFrame, part: str) -> list[str]
     posterior = fit.posterior
     shared = [scalar for scalar in fit.scalars if scalar.label in compared.index]
     gain = {scalar: 1.0 - compared.loc[scalar.label, "width_ratio"] for scalar in shared}
-    narrower = [scalar for scalar in shared if gain[scalar] > EQUAL_WIDTHS]
-    others = [scalar for scalar in shared if gain[scalar] <= EQUAL_WIDTHS]
+    # Widths that differ by less are equal, as far as draws can tell.
+    narrower = [scalar for scalar in shared if gain[scalar] > 0.05]
+    others = [scalar for scalar in shared if gain[scalar] <= 0.05]
     sentences = []
     if narrower:
         shares = [gain[scalar] for scalar in narrower]
@@ -605,7 +595,7 @@ def verdict_after_headline(calibration: CalibrationView) -> list[str]:
     return [f"{first[0].upper()}{first[1:]}", *others]
 
 
-def wrong_on_purpose(provenance: Mapping[str, Any]) -> list[str]:
+def wrong_on_purpose(provenance: Provenance) -> list[str]:
     """Whether captures were simulated by something else than what was fitted."""
     differing = [one_line(str(name)) for name in provenance.get("truth") or {}]
     if not differing:
@@ -640,13 +630,13 @@ def interval_sentences(table: pd.DataFrame, titles: Mapping[str, str]) -> list[s
 # --- Accuracy studies -----------------------------------------------------------------------------
 
 
-def reference_sentence(result: xr.DataTree | xr.Dataset) -> str:
+def reference_sentence(result: Study) -> str:
     """What the reference is, and how accurate it is."""
-    study = accuracy_dataset(result).attrs
+    view = accuracy_view(result)
+    study = view.study.attrs
     sentence = (
         f"The reference is {study['reference_draws']:,} draws of {study['reference']} with an "
         f"effective sample size of {study['reference_effective_draws']:,.0f}; its own Monte Carlo "
         f"error is at most {study['reference_error']:.2g} posterior sd."
     )
-    doubts = study["reference_doubts"]
-    return f"{sentence} Against it speaks: {doubts}." if doubts else sentence
+    return f"{sentence} Against it speaks: {view.doubts}." if view.doubts else sentence

@@ -5,7 +5,7 @@ import pytest
 from synthetic_accuracy import ROWS, make_accuracy
 
 import polar_bayes as pb
-from polar_bayes.benchmark.advice import accuracy_table, parameter_errors, pareto_front
+from polar_bayes.benchmark.advice import accuracy_table, accuracy_view, pareto_front
 
 
 def test_the_table_has_the_worst_parameter_of_every_row():
@@ -22,7 +22,7 @@ def test_the_table_has_the_worst_parameter_of_every_row():
 def test_the_larger_of_mean_and_sd_counts():
     study = make_accuracy()
     study["accuracy"]["sd_error"][1, 0] = -0.7
-    assert parameter_errors(study).loc["laplace", "roughness"] == 0.7
+    assert accuracy_view(study).errors.loc["laplace", "roughness"] == 0.7
 
 
 def test_the_front_holds_what_nothing_beats():

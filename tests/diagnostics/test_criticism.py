@@ -8,7 +8,7 @@ from scipy import stats
 from synthetic_results import SCALE, edit_provenance, make_result, replace
 
 import polar_bayes as pb
-from polar_bayes.diagnostics.criticism import CHECKS, criticize
+from polar_bayes.diagnostics.criticism import QUESTIONS, criticize
 from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.inference.checks import PROBLEM
 from polar_bayes.inference.result import provenance_of
@@ -40,7 +40,7 @@ def test_right_models_rarely_have_a_problem(layout) -> None:
         criticize(make_result(**{**SMALL, **layout}, seed=seed))["level"].eq("problem").any()
         for seed in range(40)
     )
-    assert failed <= stats.binom.isf(1e-3, 40, len(CHECKS) * PROBLEM)
+    assert failed <= stats.binom.isf(1e-3, 40, len(QUESTIONS) * PROBLEM)
 
 
 def _wave(q, zenith):

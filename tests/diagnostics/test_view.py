@@ -9,11 +9,11 @@ from synthetic_results import make_result, pool
 
 from polar_bayes.diagnostics import parameters
 from polar_bayes.diagnostics.convergence import summary
-from polar_bayes.diagnostics.criticism import criticize
-from polar_bayes.diagnostics.predictive import predictive_checks
 from polar_bayes.diagnostics.view import view_of
 from polar_bayes.errors import FitError
 from polar_bayes.inference.files import Schema
+from polar_bayes.reporting.plots_curves import curves
+from polar_bayes.reporting.plots_fit import drawable
 from polar_bayes.reporting.report import render
 
 SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
@@ -33,12 +33,11 @@ def test_a_table_is_computed_once_for_a_view_and_anew_for_a_tree() -> None:
     assert summary(result) is not summary(result)
 
 
-def test_checks_that_a_caller_gives_are_used_and_not_kept() -> None:
+def test_what_has_arguments_is_computed_once_for_each_of_them() -> None:
     fit = view_of(make_result(**SMALL))
-    assert criticize(fit, {}).loc["leave-one-out", "level"] == "not computed"
-    assert criticize(fit).loc["leave-one-out", "level"] == "passed"
-    again = criticize(fit.result, predictive_checks(fit))
-    assert again.equals(criticize(fit))
+    assert drawable(fit, material=True) is drawable(fit, material=True)
+    assert drawable(fit, material=True) != drawable(fit)
+    assert curves(fit, "dop") is curves(fit, "dop")
 
 
 def test_a_report_checks_its_fit_once_and_takes_the_posterior_apart_once(

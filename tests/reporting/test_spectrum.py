@@ -8,6 +8,7 @@ from clipping import clipped
 from synthetic_results import edit_provenance, make_result, replace
 
 import polar_bayes as pb
+from polar_bayes.diagnostics.view import view_of
 from polar_bayes.errors import FitError
 from polar_bayes.reporting import plots_curves as module
 from polar_bayes.reporting.plots_curves import LEVELS, plot_spectrum, spectra
@@ -61,7 +62,7 @@ def test_a_law_of_dispersion_has_bands_between_and_beyond_the_colors() -> None:
     assert index.levels[:, at] == pytest.approx(np.quantile(draws, LEVELS, axis=0))
     assert not found["absorption"][0].is_band
     for name in found:
-        assert clipped(plot_spectrum(result, name, found)) == []
+        assert clipped(plot_spectrum(result, name)) == []
 
 
 @pytest.mark.thorough
@@ -87,13 +88,14 @@ def test_a_process_is_drawn_from_its_prediction(monkeypatch) -> None:
         )
 
     monkeypatch.setattr(module, "predict_spectrum", predict)
-    found = spectra(edit_provenance(result, scene_parts=""))
+    fit = view_of(edit_provenance(result, scene_parts=""))
+    found = spectra(fit)
     assert asked["draws"] == 1200
     assert len(found["absorption"]) == module.MAX_MEMBERS
     assert found["absorption"][3].at.size > module.FINE
     assert found["absorption"][3].title == "material d"
     assert not found["refractive_index"][0].is_band
-    figure = plot_spectrum(result, "absorption", found)
+    figure = plot_spectrum(fit, "absorption")
     assert clipped(figure) == []
     assert len(figure.axes) == module.MAX_MEMBERS
     assert figure.get_supxlabel() == "wavelength [nm] (the first 12 of 14)"
