@@ -61,11 +61,9 @@ def information(distribution: dist.Distribution) -> FisherInformation:
     distribution = _unwrapped(distribution)
     formula = _FORMULAS.get(type(distribution))
     if formula is None:
-        raise FitError(
-            f"the Fisher information of {type(distribution).__name__} is not known",
-            where="identify",
-            hint=f"use a link that gives one of {', '.join(f.__name__ for f in _FORMULAS)}",
-        )
+        what = f"the Fisher information of {type(distribution).__name__} is not known"
+        hint = f"use a link that gives one of {', '.join(f.__name__ for f in _FORMULAS)}"
+        raise FitError(what, where="identify", hint=hint)
     parameters, matrix = formula(distribution)
     size = len(parameters)
     return FisherInformation(
