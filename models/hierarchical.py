@@ -100,18 +100,13 @@ def draw_pooled(
 def check_pooled(pooled: object, *, where: str) -> None:
     """Refuse a choice of pooled parameters that is no tuple of parameters of a material."""
     if not isinstance(pooled, tuple) or not all(isinstance(name, str) for name in pooled):
-        raise FitError(
-            f"pooled={pooled!r} is no tuple of names",
-            where=where,
-            hint="write pooled=('refractive_index',), with the comma",
-        )
+        hint = "write pooled=('refractive_index',), with the comma"
+        raise FitError(f"pooled={pooled!r} is no tuple of names", where=where, hint=hint)
     for name in pooled:
         if name not in MATERIAL_PARAMETERS:
-            raise FitError(
-                f"{name!r} is no parameter of a material",
-                where=f"{where}: pooled",
-                hint=f"name any of {', '.join(MATERIAL_PARAMETERS)}",
-            )
+            what = f"{name!r} is no parameter of a material"
+            hint = f"name any of {', '.join(MATERIAL_PARAMETERS)}"
+            raise FitError(what, where=f"{where}: pooled", hint=hint)
 
 
 def check_members(pooled: tuple[str, ...], data: Observations, scene: Scene) -> None:
@@ -119,17 +114,12 @@ def check_members(pooled: tuple[str, ...], data: Observations, scene: Scene) -> 
     possible = [name for name in MATERIAL_PARAMETERS if name in scene.parameters]
     missing = [name for name in pooled if name not in possible]
     if missing:
-        raise FitError(
-            f"the scene does not read {', '.join(missing)}",
-            where="pooled",
-            hint=f"pool any of {', '.join(possible)}",
-        )
+        hint = f"pool any of {', '.join(possible)}"
+        raise FitError(f"the scene does not read {', '.join(missing)}", where="pooled", hint=hint)
     if pooled and not any(axis not in ("wavelength", "view") for axis, _ in data.dims):
-        raise FitError(
-            "a population needs several members, and the capture has no axis patch or material",
-            where="model",
-            hint="give captures joined by polar_bayes.capture.combine, or use model='per_material'",
-        )
+        what = "a population needs several members, and the capture has no axis patch or material"
+        hint = "give captures joined by polar_bayes.capture.combine, or use model='per_material'"
+        raise FitError(what, where="model", hint=hint)
 
 
 # --- The model ------------------------------------------------------------------------------------
@@ -151,11 +141,8 @@ class Hierarchical(HTMLRepr):
     def __post_init__(self) -> None:
         check_pooled(self.pooled, where="Hierarchical")
         if not self.pooled:
-            raise FitError(
-                "nothing is pooled",
-                where="Hierarchical",
-                hint="name a parameter, or use model='per_material'",
-            )
+            hint = "name a parameter, or use model='per_material'"
+            raise FitError("nothing is pooled", where="Hierarchical", hint=hint)
 
     def __call__(
         self,

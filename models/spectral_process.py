@@ -67,23 +67,17 @@ class SpectralProcess(HTMLRepr):
 
     def __post_init__(self) -> None:
         if isinstance(self.kernel, str) and self.kernel not in KERNELS:
-            raise FitError(
-                f"there is no stationary kernel {self.kernel!r}",
-                where="SpectralProcess: kernel",
-                hint=f"give one of {', '.join(KERNELS)}, a tinygp kernel, or a function of length",
-            )
+            what = f"there is no stationary kernel {self.kernel!r}"
+            hint = f"give one of {', '.join(KERNELS)}, a tinygp kernel, or a function of length"
+            raise FitError(what, where="SpectralProcess: kernel", hint=hint)
         if not isinstance(self.kernel, str) and not callable(self.kernel):
-            raise FitError(
-                f"a {type(self.kernel).__name__} is no kernel",
-                where="SpectralProcess: kernel",
-                hint=f"give one of {', '.join(KERNELS)}, a tinygp kernel, or a function of length",
-            )
+            what = f"a {type(self.kernel).__name__} is no kernel"
+            hint = f"give one of {', '.join(KERNELS)}, a tinygp kernel, or a function of length"
+            raise FitError(what, where="SpectralProcess: kernel", hint=hint)
         if not isinstance(self.knots, int) or isinstance(self.knots, bool) or self.knots < 2:
-            raise FitError(
-                f"knots={self.knots!r} cannot span wavelengths",
-                where="SpectralProcess",
-                hint="give a whole number from 2 on; 20 is the default",
-            )
+            what = f"knots={self.knots!r} cannot span wavelengths"
+            hint = "give a whole number from 2 on; 20 is the default"
+            raise FitError(what, where="SpectralProcess", hint=hint)
 
     @property
     def fits_length(self) -> bool:
@@ -241,35 +235,26 @@ def check_spectra(coupled: object) -> None:
         or len(set(coupled)) != len(coupled)
         or not set(coupled) <= set(SPECTRA)
     ):
-        raise FitError(
-            f"coupled={coupled!r} names no spectra",
-            where="GpSpectral",
-            hint=f"give a tuple of one or both of {', '.join(SPECTRA)}",
-        )
+        hint = f"give a tuple of one or both of {', '.join(SPECTRA)}"
+        raise FitError(f"coupled={coupled!r} names no spectra", where="GpSpectral", hint=hint)
 
 
 def check_processes(coupled: tuple[str, ...], process: object) -> None:
     """Refuse processes that do not pair with their spectra."""
     given = process if isinstance(process, tuple) else (process,) * len(coupled)
     if len(given) != len(coupled) or not all(isinstance(p, SpectralProcess) for p in given):
-        raise FitError(
-            f"process={process!r} does not say what {' and '.join(coupled)} follow",
-            where="GpSpectral",
-            hint="give one SpectralProcess(), or a tuple with one for each",
-        )
+        what = f"process={process!r} does not say what {' and '.join(coupled)} follow"
+        hint = "give one SpectralProcess(), or a tuple with one for each"
+        raise FitError(what, where="GpSpectral", hint=hint)
 
 
 def check_capture(coupled: tuple[str, ...], data: Observations, scene: Scene) -> None:
     """Refuse a capture without colors, and a scene without spectra."""
     if "wavelength" not in dict(data.dims):
-        raise FitError(
-            "the capture has no axis wavelength to couple",
-            where="gp_spectral",
-            hint="fit it with model='per_material', or give it the axis and a coordinate in nm",
-        )
+        what = "the capture has no axis wavelength to couple"
+        hint = "fit it with model='per_material', or give it the axis and a coordinate in nm"
+        raise FitError(what, where="gp_spectral", hint=hint)
     if scene.dispersion is None and not set(coupled) & set(scene.parameters):
-        raise FitError(
-            f"the scene reads no {' and no '.join(coupled)}",
-            where="gp_spectral",
-            hint=f"couple one of {', '.join(n for n in SPECTRA if n in scene.parameters)}",
-        )
+        what = f"the scene reads no {' and no '.join(coupled)}"
+        hint = f"couple one of {', '.join(n for n in SPECTRA if n in scene.parameters)}"
+        raise FitError(what, where="gp_spectral", hint=hint)

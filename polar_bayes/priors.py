@@ -616,11 +616,9 @@ class PriorTable(Mapping[str, dist.Distribution]):
 
     def __init__(self, overrides: Mapping[str, dist.Distribution] | None = None) -> None:
         if not isinstance(overrides, Mapping | None):
-            raise FitError(
-                f"a {type(overrides).__name__} does not name what it replaces",
-                where="priors",
-                hint="give a mapping such as {'roughness': HalfNormal(0.1)}",
-            )
+            what = f"a {type(overrides).__name__} does not name what it replaces"
+            hint = "give a mapping such as {'roughness': HalfNormal(0.1)}"
+            raise FitError(what, where="priors", hint=hint)
         self._rows = {**PRIORS, **(overrides or {})}
         self._read: dict[str, None] = {}
 
@@ -636,11 +634,8 @@ class PriorTable(Mapping[str, dist.Distribution]):
     def row(self, name: str) -> dist.Distribution:
         """The prior as it was given."""
         if name not in self._rows:
-            raise FitError(
-                "this parameter has no prior",
-                where=f"priors[{name!r}]",
-                hint=f"give one: priors={{{name!r}: <a NumPyro distribution>}}",
-            )
+            hint = f"give one: priors={{{name!r}: <a NumPyro distribution>}}"
+            raise FitError("this parameter has no prior", where=f"priors[{name!r}]", hint=hint)
         self._read[name] = None
         if not isinstance(self._rows[name], dist.Distribution):
             _refuse_prior(self._rows[name], f"priors[{name!r}]")
@@ -687,11 +682,8 @@ def check_support(name: str, prior: dist.Distribution, where: str) -> None:
     except jax.errors.ConcretizationTypeError:
         return  # bounds that depend on other parameters are known only when it runs
     if low < least or high > most:
-        raise FitError(
-            f"{type(prior).__name__} allows values outside {least:g} to {most:g}",
-            where=where,
-            hint=_in_range(least, most),
-        )
+        what = f"{type(prior).__name__} allows values outside {least:g} to {most:g}"
+        raise FitError(what, where=where, hint=_in_range(least, most))
 
 
 def _in_range(least: float, most: float) -> str:
@@ -710,11 +702,8 @@ def _check_override(name: str, prior: object, parameters: tuple[str, ...]) -> No
         near = [known for known in parameters if notation(known).symbol == name]
         near = near or difflib.get_close_matches(name, parameters, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
-        raise FitError(
-            "no such parameter in this model",
-            where=where,
-            hint=f"{hint}the parameters are {', '.join(parameters)}",
-        )
+        hint = f"{hint}the parameters are {', '.join(parameters)}"
+        raise FitError("no such parameter in this model", where=where, hint=hint)
     if not isinstance(prior, dist.Distribution):
         _refuse_prior(prior, where)
     _check_shape(name, prior, where)
@@ -737,24 +726,17 @@ def _refuse_prior(prior: object, where: str) -> NoReturn:
 def _check_shape(name: str, prior: dist.Distribution, where: str) -> None:
     """Refuse what would be repeated over the wrong axes, or cannot be differentiated."""
     if prior.support.is_discrete:
-        raise FitError(
-            f"{type(prior).__name__} is discrete, and samplers follow gradients",
-            where=where,
-            hint="give a continuous distribution",
-        )
+        what = f"{type(prior).__name__} is discrete, and samplers follow gradients"
+        raise FitError(what, where=where, hint="give a continuous distribution")
     usual = PRIORS.get(name)
     if usual is None:
         return  # a parameter of the user's own has the shape that its reader expects
     if len(prior.event_shape) != len(usual.event_shape):
         to_event = "one number" if not usual.event_shape else "a vector: use .expand([n])"
-        raise FitError(
-            f"one draw of it has shape {tuple(prior.event_shape)}",
-            where=where,
-            hint=f"give a distribution of {to_event}{'.to_event(1)' if usual.event_shape else ''}",
-        )
+        what = f"one draw of it has shape {tuple(prior.event_shape)}"
+        hint = f"give a distribution of {to_event}{'.to_event(1)' if usual.event_shape else ''}"
+        raise FitError(what, where=where, hint=hint)
     if prior.batch_shape and prior.batch_shape[-1] != 1:
-        raise FitError(
-            f"it is a batch of {prior.batch_shape[-1]} distributions",
-            where=where,
-            hint="give one, or one per wavelength in shape (wavelength, 1): views share it",
-        )
+        what = f"it is a batch of {prior.batch_shape[-1]} distributions"
+        hint = "give one, or one per wavelength in shape (wavelength, 1): views share it"
+        raise FitError(what, where=where, hint=hint)

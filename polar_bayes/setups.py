@@ -95,11 +95,8 @@ def find_setup(name: str | Setup) -> Setup:
     if isinstance(name, Setup):
         return name
     if not isinstance(name, str) or name not in SETUPS:
-        raise SceneError(
-            "no such scene",
-            where=f"scene={name!r}",
-            hint=f"give one of {', '.join(SETUPS)}, or a polar_bayes.Scene",
-        )
+        hint = f"give one of {', '.join(SETUPS)}, or a polar_bayes.Scene"
+        raise SceneError("no such scene", where=f"scene={name!r}", hint=hint)
     return SETUPS[name]
 
 

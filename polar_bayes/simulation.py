@@ -84,9 +84,8 @@ PRESETS: Mapping[str, Material] = MappingProxyType(
 def find_preset(name: str) -> Material:
     """The material of that name."""
     if not isinstance(name, str) or name not in PRESETS:
-        raise CaptureError(
-            "no such material", where=f"preset={name!r}", hint=f"give one of {', '.join(PRESETS)}"
-        )
+        hint = f"give one of {', '.join(PRESETS)}"
+        raise CaptureError("no such material", where=f"preset={name!r}", hint=hint)
     return PRESETS[name]
 
 
@@ -345,9 +344,8 @@ def simulate(
     setup = Setup(scene, SETUPS["paper"].links) if isinstance(scene, Scene) else find_setup(scene)
     links = _checked_links(setup.links if links is None else links)
     if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**32:
-        raise CaptureError(
-            f"seed is {seed!r}", where="simulate", hint="give an integer from 0 to 2**32 - 1"
-        )
+        hint = "give an integer from 0 to 2**32 - 1"
+        raise CaptureError(f"seed is {seed!r}", where="simulate", hint=hint)
     material = preset if isinstance(preset, Material) else find_preset(preset)
     wavelengths = np.asarray(protocol.wavelengths, float)
     truth = checked_parameters(setup.scene, material, wavelengths, parameters or {})

@@ -254,11 +254,8 @@ def _check_shared(names: Sequence[str], request: Request) -> None:
     for name in names:
         known = [each for each in request.priors if each not in MATERIAL_PARAMETERS]
         if name not in known or request.priors[name].event_shape:
-            raise FitError(
-                "an image cannot share it",
-                where=f"fit_pixels: shared={name!r}",
-                hint=f"give names among {', '.join(known)}",
-            )
+            what, hint = "an image cannot share it", f"give names among {', '.join(known)}"
+            raise FitError(what, where=f"fit_pixels: shared={name!r}", hint=hint)
 
 
 def _with_shared(plan: MapPlan, capture: xr.Dataset) -> MapPlan:

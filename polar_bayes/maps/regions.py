@@ -82,9 +82,8 @@ def region_means(
     """
     names = map_parameters(maps)
     if not names or "status" not in maps:
-        raise FitError(
-            "it holds no maps", where="region_means", hint="give what fit_pixels returns"
-        )
+        hint = "give what fit_pixels returns"
+        raise FitError("it holds no maps", where="region_means", hint=hint)
     number, found = _numbered(maps, labels)
     reference = None if against is None else _position(found, against)
     counts = np.zeros((2, len(found)), int)
@@ -169,11 +168,9 @@ def load_labels(path: str | os.PathLike[str]) -> np.ndarray:
     """
     values = read_image(path, "labels")
     if values.ndim != len(IMAGE) or values.dtype.kind not in "biu":
-        raise CaptureError(
-            f"it has values of shape {values.shape} and type {values.dtype}",
-            where=f"labels {path}",
-            hint="save it with one channel of whole numbers: one gray value for each region",
-        )
+        what = f"it has values of shape {values.shape} and type {values.dtype}"
+        hint = "save it with one channel of whole numbers: one gray value for each region"
+        raise CaptureError(what, where=f"labels {path}", hint=hint)
     return values
 
 
@@ -183,11 +180,9 @@ def _numbered(maps: xr.Dataset, labels: xr.DataArray | np.ndarray) -> tuple[np.n
         labels = labels.transpose(*IMAGE).to_numpy()
     values, shape = np.asarray(labels), tuple(maps.sizes[dim] for dim in IMAGE)
     if values.shape != shape or values.dtype.kind not in "biuU":
-        raise FitError(
-            f"they are {values.dtype} of shape {values.shape}",
-            where="region_means: labels",
-            hint=f"give truth values, integers or texts, one for each of {shape} pixels",
-        )
+        what = f"they are {values.dtype} of shape {values.shape}"
+        hint = f"give truth values, integers or texts, one for each of {shape} pixels"
+        raise FitError(what, where="region_means: labels", hint=hint)
     found, number = np.unique(values, return_inverse=True)
     is_region = found != np.zeros((), found.dtype)
     if not is_region.any():

@@ -189,11 +189,8 @@ def estimate_shared(
             modes = None
             continue
         if count < LEAST_PIXELS:
-            raise FitError(
-                f"only {count} pixels have an answer (at least {LEAST_PIXELS})",
-                where=where,
-                hint="let each pixel have its own: shared=()",
-            )
+            what = f"only {count} pixels have an answer (at least {LEAST_PIXELS})"
+            raise FitError(what, where=where, hint="let each pixel have its own: shared=()")
         slope, curvature = _prior_derivatives(names, priors, mean)
         total, whole = slope + found.slope.sum(axis=0), curvature + found.information.sum(axis=0)
         ratio = np.max(sd**2 * _precision(whole))
@@ -226,11 +223,8 @@ def estimate_shared(
         step = step / max(1.0, np.max(np.abs(step) / sd) / LONGEST_STEP)
         mean, reached = mean + step, np.maximum(reached, 0.5 * np.abs(step))
         sd = np.clip(reached, sd / SHRINKAGE, GROWTH * sd)
-    raise FitError(
-        f"their search has not settled in {MOST_STEPS} steps",
-        where=where,
-        hint="let each pixel have its own: shared=(), or share fewer",
-    )
+    hint = "let each pixel have its own: shared=(), or share fewer"
+    raise FitError(f"their search has not settled in {MOST_STEPS} steps", where=where, hint=hint)
 
 
 def _precision(information: np.ndarray) -> np.ndarray:

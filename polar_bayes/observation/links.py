@@ -150,11 +150,8 @@ def scale_by_confidence(
 def _check_range(owner: object, field: str, low: float, high: float, note: str = "") -> None:
     value = getattr(owner, field)
     if not low <= value <= high:
-        raise FitError(
-            f"{field} is {value}",
-            where=type(owner).__name__,
-            hint=f"give a number from {low:g} to {high:g}{note}",
-        )
+        hint = f"give a number from {low:g} to {high:g}{note}"
+        raise FitError(f"{field} is {value}", where=type(owner).__name__, hint=hint)
 
 
 # --- Links ----------------------------------------------------------------------------------------
@@ -212,11 +209,8 @@ class _DopLink(AbstractLink):
 
     def __post_init__(self) -> None:
         if not 1e-6 <= self.margin <= 1e-3:
-            raise FitError(
-                f"margin is {self.margin}",
-                where=type(self).__name__,
-                hint="give a number from 1e-6 to 1e-3, the paper's range of epsilon",
-            )
+            hint = "give a number from 1e-6 to 1e-3, the paper's range of epsilon"
+            raise FitError(f"margin is {self.margin}", where=type(self).__name__, hint=hint)
 
     @override
     def reading(self, value: Float[Array, "... view"]) -> Float[Array, "... view"]:
@@ -330,17 +324,12 @@ class StokesLink(AbstractLink):
 
     def __post_init__(self) -> None:
         if self.degrees_of_freedom is not None and not self.degrees_of_freedom > 2.0:
-            raise FitError(
-                f"degrees_of_freedom is {self.degrees_of_freedom}",
-                where="StokesLink",
-                hint="give a number above 2, or None for normal noise",
-            )
+            what = f"degrees_of_freedom is {self.degrees_of_freedom}"
+            hint = "give a number above 2, or None for normal noise"
+            raise FitError(what, where="StokesLink", hint=hint)
         if not 0.0 < self.least_brightness <= 1.0:
-            raise FitError(
-                f"least_brightness is {self.least_brightness}",
-                where="StokesLink",
-                hint="give a number above 0 and up to 1",
-            )
+            what = f"least_brightness is {self.least_brightness}"
+            raise FitError(what, where="StokesLink", hint="give a number above 0 and up to 1")
 
     @property
     @override
@@ -358,11 +347,9 @@ class StokesLink(AbstractLink):
     ) -> dist.Distribution:
         if self.stated_errors:
             if name not in data.errors:
-                raise FitError(
-                    f"the capture states no {name}_error",
-                    where="StokesLink(stated_errors=True)",
-                    hint="add that variable to the capture or use stated_errors=False",
-                )
+                what = f"the capture states no {name}_error"
+                hint = "add that variable to the capture or use stated_errors=False"
+                raise FitError(what, where="StokesLink(stated_errors=True)", hint=hint)
             location, scale = prediction[name], noise["stokes_error_factor"] * data.errors[name]
         else:
             light = self._brightness(prediction, data, noise)

@@ -91,11 +91,9 @@ class FacetQuadrature(Part):
         for name in ("along", "across"):
             nodes = getattr(self, name)
             if not (isinstance(nodes, int) and 1 <= nodes <= 64):
-                raise SceneError(
-                    f"{name}={nodes!r} is no number of nodes",
-                    where="FacetQuadrature",
-                    hint="give a whole number from 1 to 64",
-                )
+                what = f"{name}={nodes!r} is no number of nodes"
+                hint = "give a whole number from 1 to 64"
+                raise SceneError(what, where="FacetQuadrature", hint=hint)
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:

@@ -260,11 +260,9 @@ class Disc(AbstractExtendedSource):
 
     def __post_init__(self) -> None:
         if not 0.01 <= self.half_width <= 90.0:
-            raise SceneError(
-                f"half_width={self.half_width!r} is no half width of a disc",
-                where="Disc",
-                hint="give degrees from 0.01 to 90, or use PointSource() or UniformSky()",
-            )
+            what = f"half_width={self.half_width!r} is no half width of a disc"
+            hint = "give degrees from 0.01 to 90, or use PointSource() or UniformSky()"
+            raise SceneError(what, where="Disc", hint=hint)
 
     @override
     def border(self, sin_view: Array, cos_view: Array) -> Window:

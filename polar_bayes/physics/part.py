@@ -111,11 +111,9 @@ def check_setting(value: object, where: str, low: float, high: float) -> None:
         return
     numeric = isinstance(value, int | float) and not isinstance(value, bool)
     if not (numeric and low <= value <= high):  # type: ignore[operator]
-        raise SceneError(
-            f"{value!r} is neither a number from {low:g} to {high:g} nor a parameter's name",
-            where=where,
-            hint="give the number where it is known, or a name such as 'coat_absorbance' to fit it",
-        )
+        what = f"{value!r} is neither a number from {low:g} to {high:g} nor a parameter's name"
+        hint = "give the number where it is known, or a name such as 'coat_absorbance' to fit it"
+        raise SceneError(what, where=where, hint=hint)
 
 
 def unit_rule(count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -112,17 +112,12 @@ class Scene(HTMLRepr):
             if getattr(self, name) is not None:
                 check_part(getattr(self, name), name, kind, allowed)
         if self.mixing is not None and self.subsurface is None:
-            raise SceneError(
-                "there is no subsurface to mix",
-                where="mixing",
-                hint="give a subsurface, such as Depolarizer(), or leave mixing=None",
-            )
+            hint = "give a subsurface, such as Depolarizer(), or leave mixing=None"
+            raise SceneError("there is no subsurface to mix", where="mixing", hint=hint)
         if self.subsurface is not None and self.mixing is None:
-            raise SceneError(
-                "nothing says how its light adds to the surface's",
-                where="subsurface",
-                hint="give mixing=StokesMixing() or DopMixing(), or leave subsurface=None",
-            )
+            what = "nothing says how its light adds to the surface's"
+            hint = "give mixing=StokesMixing() or DopMixing(), or leave subsurface=None"
+            raise SceneError(what, where="subsurface", hint=hint)
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -232,11 +227,8 @@ class Scene(HTMLRepr):
         rest = tuple(part for part in terms if not isinstance(part, term))
         if len(rest) == len(terms):
             present = ", ".join(type(part).__name__ for part in terms) or "none"
-            raise SceneError(
-                f"the scene has no {term.__name__}",
-                where="without",
-                hint=f"name one of its instrument terms: {present}",
-            )
+            hint = f"name one of its instrument terms: {present}"
+            raise SceneError(f"the scene has no {term.__name__}", where="without", hint=hint)
         return dataclasses.replace(self, instrument=Instrument(rest) if rest else None)
 
     def _optics(self, parameters: Parameters, geometry: Geometry) -> Light:
@@ -264,11 +256,9 @@ class Scene(HTMLRepr):
 
     def _wavelength(self, geometry: Geometry) -> Array:
         if geometry.wavelength is None:
-            raise SceneError(
-                "a law of dispersion needs a wavelength, and there is none",
-                where="dispersion",
-                hint="give the geometry a wavelength in nm, or the capture such a coordinate",
-            )
+            what = "a law of dispersion needs a wavelength, and there is none"
+            hint = "give the geometry a wavelength in nm, or the capture such a coordinate"
+            raise SceneError(what, where="dispersion", hint=hint)
         return geometry.wavelength
 
     def _per_view(
@@ -279,11 +269,8 @@ class Scene(HTMLRepr):
         needed = [name for name in self.parameters if name in names]
         missing = [name for name in needed if name not in parameters]
         if missing:
-            raise SceneError(
-                f"{', '.join(missing)} missing",
-                where="parameters",
-                hint=f"this scene reads {', '.join(needed)}",
-            )
+            hint = f"this scene reads {', '.join(needed)}"
+            raise SceneError(f"{', '.join(missing)} missing", where="parameters", hint=hint)
         dtype = jnp.result_type(geometry.dtype, *(parameters[name] for name in needed))
         return {name: jnp.asarray(parameters[name], dtype)[..., None] for name in needed}
 

@@ -95,11 +95,9 @@ class TwoBounceSurface(RoughSurface):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.illumination not in (PointSource(), UniformSky()):
-            raise SceneError(
-                f"{self.illumination!r} has no second bounce",
-                where="TwoBounceSurface: illumination",
-                hint="give PointSource() or UniformSky(), or use RoughSurface",
-            )
+            what = f"{self.illumination!r} has no second bounce"
+            hint = "give PointSource() or UniformSky(), or use RoughSurface"
+            raise SceneError(what, where="TwoBounceSurface: illumination", hint=hint)
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:
