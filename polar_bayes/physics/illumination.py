@@ -30,13 +30,8 @@ from polar_bayes.physics.stokes import (
     transmit_inward,
 )
 
-# Directions in a disc, by angle from its center and by azimuth, when counting the light that
-# enters the body: exact to 1e-6 of it while the disc is above the horizon, and to .002 (half
-# width 15, 89 degrees) where the horizon cuts it.
-DISC_NODES = 8
-
-# Zenith angles of the sky's rays, where a body asks for them.
-SKY_NODES = 8
+Beams = tuple[Geometry, Light]
+"""Rays that come from the light, and what of each enters the body."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,9 +83,7 @@ class AbstractIllumination(Part):
         del parameters, geometry
         return None
 
-    def beams(
-        self, stack: Stack, geometry: Geometry, parameters: Parameters
-    ) -> tuple[Geometry, Light]:
+    def beams(self, stack: Stack, geometry: Geometry, parameters: Parameters) -> Beams:
         """Light that passes into the body, ray by ray; see `rays` and `entering`."""
         rays, irradiance = self.rays(geometry)
         cos_light = cos_degrees(rays.light_zenith)
@@ -231,11 +224,11 @@ class UniformSky(AbstractExtendedSource):
     def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
         # A squared cosine for the nodes, since transmission is steep at grazing. Four azimuths sum
         # up once and twice around to nothing, which is all that scattering knows of azimuth.
-        cosine, weight = squared_rule(SKY_NODES)
+        cosine, weight = squared_rule(8)
         solid_angle = 0.5 * np.pi * weight
         rays = per_ray(geometry)
         zenith, azimuth = np.degrees(np.arccos(cosine)), 90.0 * np.arange(4.0)
-        around = like(np.tile(azimuth, SKY_NODES), rays.view_azimuth)
+        around = like(np.tile(azimuth, cosine.size), rays.view_azimuth)
         return (
             rays._replace(
                 light_zenith=like(np.repeat(zenith, 4), rays.view_zenith),
@@ -310,16 +303,16 @@ class Disc(AbstractExtendedSource):
 
     def _directions(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Cosine from the axis, sine times cosine of azimuth, and solid angle of each direction."""
-        node, weight = unit_rule(DISC_NODES)
+        # Exact to 1e-6 of the light that enters the body while the disc is above the horizon, and
+        # to .002 (half width 15, 89 degrees) where the horizon cuts it.
+        count = 8  # of angles from the center, and of azimuths
+        node, weight = unit_rule(count)
         # Equal steps in the squared sine of half the angle are equal solid angles.
         square = math.sin(math.radians(self.half_width) / 2.0) ** 2
         ring = node * square
         cosine = 1.0 - 2.0 * ring
         sine = 2.0 * np.sqrt(ring * (1.0 - ring))
-        azimuth = np.pi * (np.arange(DISC_NODES) + 0.5) / DISC_NODES
-        ring_solid_angle = 4.0 * np.pi * weight * square / DISC_NODES
-        return (
-            np.repeat(cosine, DISC_NODES),
-            np.outer(sine, np.cos(azimuth)).ravel(),
-            np.repeat(ring_solid_angle, DISC_NODES),
-        )
+        azimuth = np.pi * (np.arange(count) + 0.5) / count
+        ring_solid_angle = 4.0 * np.pi * weight * square / count
+        along = np.outer(sine, np.cos(azimuth)).ravel()
+        return np.repeat(cosine, count), along, np.repeat(ring_solid_angle, count)

@@ -303,10 +303,6 @@ class Saturation(AbstractInstrumentTerm):
 # --- A tilted normal: what a patch sees if it is not level ----------------------------------------
 
 
-# Largest tilt along either axis, in degrees: a sampler may ask for more, and gets this.
-LARGEST_TILT = 80.0
-
-
 class Direction(NamedTuple):
     """A direction in the frame of the true normal, in degrees.
 
@@ -355,8 +351,8 @@ class TiltedNormal(Part):
     ) -> tuple[Geometry, tuple[Array, Array]]:
         """Directions in the frame of the true normal, and the turn of the viewer's frame."""
         tilts = (value_of(tilt, parameters) for tilt in (self.tilt_x, self.tilt_y))
-        bounded = (jnp.deg2rad(jnp.clip(tilt, -LARGEST_TILT, LARGEST_TILT)) for tilt in tilts)
-        slopes = [jnp.tan(tilt) for tilt in bounded]
+        # A sampler may ask for more than 80 degrees along an axis, and gets 80.
+        slopes = [jnp.tan(jnp.deg2rad(jnp.clip(tilt, -80.0, 80.0))) for tilt in tilts]
         view = tilted_direction(geometry.view_zenith, geometry.view_azimuth, *slopes)
         light = tilted_direction(geometry.light_zenith, geometry.light_azimuth, *slopes)
         inside = Geometry(

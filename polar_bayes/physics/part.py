@@ -163,7 +163,7 @@ class Quantity(NamedTuple):
     unit: str = "1"
 
 
-NOTATION: dict[str, Quantity] = {
+MATERIAL: dict[str, Quantity] = {
     "roughness": Quantity("r", "roughness"),
     "subsurface_fraction": Quantity("beta", "subsurface fraction"),
     "absorption": Quantity("a", "absorption relative to scattering"),
@@ -181,14 +181,19 @@ NOTATION: dict[str, Quantity] = {
     "coat_absorbance": Quantity("", "absorbance of the coat at normal incidence"),
     "film_refractive_index": Quantity("", "refractive index of the film"),
     "film_thickness": Quantity("", "thickness of the film", "nm"),
+    "normal_tilt_x": Quantity("", "lean of the normal towards azimuth 0", "degree"),
+    "normal_tilt_y": Quantity("", "lean of the normal towards azimuth 90", "degree"),
+}
+"""Of a material, in the order in which they are listed; the others belong to a whole capture."""
+
+NOTATION: dict[str, Quantity] = {
+    **MATERIAL,
     "refractive_index_level": Quantity("", "level of n over wavelength"),
     "refractive_index_amplitude": Quantity("", "departure of n from its level"),
     "refractive_index_length": Quantity("", "length over which n changes", "nm"),
     "absorption_level": Quantity("", "level of a over wavelength"),
     "absorption_amplitude": Quantity("", "departure of log a from its level"),
     "absorption_length": Quantity("", "length over which a changes", "nm"),
-    "normal_tilt_x": Quantity("", "lean of the normal towards azimuth 0", "degree"),
-    "normal_tilt_y": Quantity("", "lean of the normal towards azimuth 90", "degree"),
     "angle_zero": Quantity("", "offset of both zenith angles", "degree"),
     "beam_overlap_zenith": Quantity("", "zenith where the beam fills the sample", "degree"),
     "dolp_gain": Quantity("", "share of the polarization that is recorded"),
@@ -233,15 +238,10 @@ ABSENT: dict[str, Absence] = {
 """The simplest world: a bare and smooth surface, and an instrument without faults."""
 
 
-POPULATION = {
-    "_location": "population median of",
-    "_spread": "population spread of",
-}
-
-
 def notation(name: str) -> Quantity:
     """The row of a parameter, or of its population, or one made of its name."""
-    for ending, words in POPULATION.items():
+    population = {"_location": "population median of", "_spread": "population spread of"}
+    for ending, words in population.items():
         if name.endswith(ending) and name.removesuffix(ending) in NOTATION:
             _, meaning, unit = NOTATION[name.removesuffix(ending)]
             return Quantity("", f"{words} {meaning}", unit if ending == "_location" else "1")

@@ -27,7 +27,7 @@ from polar_bayes.physics.instrument import (
 )
 from polar_bayes.physics.microfacet import Beckmann, HeightCorrelatedShadowing
 from polar_bayes.physics.mixing import AbstractMixing, DopMixing, StokesMixing
-from polar_bayes.physics.part import Parameters, check_part, notation, parameters_of
+from polar_bayes.physics.part import MATERIAL, Parameters, check_part, notation, parameters_of
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import Light, degree_of_linear_polarization, to_stokes
 from polar_bayes.physics.subsurface import AbstractSubsurface, Depolarizer, Lambertian, Unpolarized
@@ -40,29 +40,7 @@ from polar_bayes.physics.surface import (
 )
 from polar_bayes.repr_html import HTMLRepr, Row, Table
 
-# Parameters of a material, in the order in which they are listed; every other one that a scene
-# reads belongs to the whole capture.
-MATERIAL_PARAMETERS = (
-    "roughness",
-    "subsurface_fraction",
-    "absorption",
-    "refractive_index",
-    "roughness_across",
-    "roughness_azimuth",
-    "albedo",
-    "anisotropy",
-    "polarized_fraction",
-    "cauchy_a",
-    "cauchy_b",
-    "sellmeier_strength",
-    "sellmeier_resonance",
-    "coat_refractive_index",
-    "coat_absorbance",
-    "film_refractive_index",
-    "film_thickness",
-    "normal_tilt_x",
-    "normal_tilt_y",
-)
+MATERIAL_PARAMETERS = tuple(MATERIAL)
 
 
 @dataclasses.dataclass(frozen=True)

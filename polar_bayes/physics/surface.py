@@ -17,7 +17,7 @@ from polar_bayes.physics.geometry import (
     per_ray,
     sin_degrees,
 )
-from polar_bayes.physics.illumination import AbstractIllumination, PointSource
+from polar_bayes.physics.illumination import AbstractIllumination, Beams, PointSource
 from polar_bayes.physics.microfacet import (
     AbstractMicrofacet,
     AbstractShadowing,
@@ -169,9 +169,7 @@ class AbstractSurface(Part):
         """
 
     @abc.abstractmethod
-    def beams(
-        self, parameters: Parameters, geometry: Geometry, stack: Stack
-    ) -> tuple[Geometry, Light]:
+    def beams(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Beams:
         """The same light ray by ray, for a body that asks where it comes from.
 
         Returns:
@@ -220,9 +218,7 @@ class SmoothSurface(AbstractSurface):
         return self.beam.entering(stack, geometry, parameters)
 
     @override
-    def beams(
-        self, parameters: Parameters, geometry: Geometry, stack: Stack
-    ) -> tuple[Geometry, Light]:
+    def beams(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Beams:
         return self.beam.beams(stack, geometry, parameters)
 
     @override
@@ -290,9 +286,7 @@ class RoughSurface(AbstractSurface):
         return Light(total, quotient(q, total), quotient(u, total))
 
     @override
-    def beams(
-        self, parameters: Parameters, geometry: Geometry, stack: Stack
-    ) -> tuple[Geometry, Light]:
+    def beams(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Beams:
         if not self.way_out.both_ways:
             return self.illumination.beams(stack, geometry, parameters)
         rays, irradiance = self.illumination.rays(geometry)
@@ -337,7 +331,7 @@ class Interface:
         """Light that passes into the body; see `AbstractSurface.entering`."""
         return self.surface.entering(parameters, geometry, self.stack)
 
-    def beams(self, parameters: Parameters, geometry: Geometry) -> tuple[Geometry, Light]:
+    def beams(self, parameters: Parameters, geometry: Geometry) -> Beams:
         """The same ray by ray; see `AbstractSurface.beams`."""
         return self.surface.beams(parameters, geometry, self.stack)
 
