@@ -3,7 +3,7 @@
 import contextlib
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any, override
+from typing import override
 
 import jax
 import jax.numpy as jnp
@@ -117,7 +117,7 @@ class SoftClip(Transform):
         return x - self.scale * jnp.log(-jnp.expm1(-below))
 
     @override
-    def log_abs_det_jacobian(self, x: Array, y: Array, intermediates: Any = None) -> Array:
+    def log_abs_det_jacobian(self, x: Array, y: Array, intermediates: object = None) -> Array:
         slope = jax.nn.log_sigmoid((x - self.low) / self.scale)
         if math.isinf(self.high):
             return slope

@@ -21,7 +21,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, NoReturn, override
+from typing import NoReturn, override
 
 import jax
 import jax.numpy as jnp
@@ -328,6 +328,14 @@ def short_numbers(text: str) -> str:
     return re.sub(r"\d+\.\d+(?:e[+-]?\d+)?", lambda found: f"{float(found[0]):g}", text)
 
 
+def unwrapped(distribution: dist.Distribution) -> dist.Distribution:
+    """The distribution inside of masks, copies and events."""
+    wrappers = dist.distribution.MaskedDistribution | dist.ExpandedDistribution | dist.Independent
+    while isinstance(distribution, wrappers):
+        distribution = distribution.base_dist
+    return distribution
+
+
 def _safely_described(prior: dist.Distribution, style: "_Readable") -> str:
     try:
         return style.describe(prior)
@@ -336,14 +344,16 @@ def _safely_described(prior: dist.Distribution, style: "_Readable") -> str:
         return type(prior).__name__
 
 
+type Mixture = dist.MixtureSameFamily | dist.MixtureGeneral
+
+
 class _Readable:
     """Descriptions for readers."""
 
     def describe(self, prior: dist.Distribution) -> str:
         """A distribution with its arguments."""
         shape = (*prior.batch_shape, *prior.event_shape)
-        while isinstance(prior, _WRAPPERS):
-            prior = prior.base_dist
+        prior = unwrapped(prior)
         copies = f" x {shape}" if shape != (*prior.batch_shape, *prior.event_shape) else ""
         return f"{self._call(prior)}{copies}"
 
@@ -359,7 +369,12 @@ class _Readable:
         return f"<array {numbers.shape}>"
 
     def _call(self, prior: dist.Distribution) -> str:
-        if isinstance(prior, _TRUNCATED):
+        if isinstance(
+            prior,
+            dist.LeftTruncatedDistribution
+            | dist.RightTruncatedDistribution
+            | dist.TwoSidedTruncatedDistribution,
+        ):
             return self.truncated(prior)
         if isinstance(prior, dist.MixtureSameFamily | dist.MixtureGeneral):
             return self.mixture(prior)
@@ -381,7 +396,7 @@ class _Readable:
         bounds = zip(("low", "high"), support_bounds(prior), strict=True)
         return ", ".join(f"{key}={self.number(x)}" for key, x in bounds if math.isfinite(x))
 
-    def mixture(self, prior: Any) -> str:
+    def mixture(self, prior: Mixture) -> str:
         weights = self.text(np.asarray(prior.mixing_distribution.probs))
         return f"Mixture(weights={weights}, {', '.join(map(self.describe, _components(prior)))})"
 
@@ -427,7 +442,7 @@ class _Exact(_Readable):
         return f"TruncatedDistribution({self.describe(prior.base_dist)}, {self.bounds(prior)})"
 
     @override
-    def mixture(self, prior: Any) -> str:
+    def mixture(self, prior: Mixture) -> str:
         weights = f"CategoricalProbs({self.fields({'probs': prior.mixing_distribution.probs})})"
         inner = ", ".join(map(self.describe, _components(prior)))
         several = isinstance(prior, dist.MixtureGeneral)
@@ -438,22 +453,14 @@ class _Exact(_Readable):
         return f"[{', '.join(steps)}]"
 
 
-_WRAPPERS = (dist.Independent, dist.ExpandedDistribution, dist.distribution.MaskedDistribution)
-_TRUNCATED = (
-    dist.LeftTruncatedDistribution,
-    dist.RightTruncatedDistribution,
-    dist.TwoSidedTruncatedDistribution,
-)
-
-
-def _components(prior: Any) -> Sequence[dist.Distribution]:
+def _components(prior: Mixture) -> Sequence[dist.Distribution]:
     """Components of a mixture."""
     is_general = isinstance(prior, dist.MixtureGeneral)
     return prior.component_distributions if is_general else [prior.component_distribution]
 
 
 @functools.cache
-def _distributions() -> Mapping[str, Callable[..., Any]]:
+def _distributions() -> Mapping[str, Callable[..., object]]:
     """What the text of a prior may name: the distributions and transforms of NumPyro."""
     names = (name for name in dist.__all__ if name[:1].isupper())
     own = {"HalfNormal": HalfNormal, "Beta": Beta}
@@ -462,7 +469,7 @@ def _distributions() -> Mapping[str, Callable[..., Any]]:
     return {name: _with_arrays(made) for name, made in known.items()}
 
 
-def _with_arrays(made: Callable[..., Any]) -> Callable[..., Any]:
+def _with_arrays(made: Callable[..., object]) -> Callable[..., object]:
     """The same for arguments that are tuples of numbers, which NumPyro takes as arrays."""
 
     def convert(argument: object) -> object:
@@ -473,7 +480,7 @@ def _with_arrays(made: Callable[..., Any]) -> Callable[..., Any]:
         return list(argument) if of_parts else np.asarray(argument, float)
 
     @functools.wraps(made)
-    def make(*arguments: object, **keywords: object) -> Any:
+    def make(*arguments: object, **keywords: object) -> object:
         return made(*map(convert, arguments), **{k: convert(x) for k, x in keywords.items()})
 
     return make

@@ -36,6 +36,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.distributions import MeanConcentrationBeta, SensorStudentT
+from polar_bayes.priors import unwrapped
 
 # --- Fisher information of one reading about the parameters of its own distribution ---------------
 
@@ -58,7 +59,7 @@ class FisherInformation(NamedTuple):
 def information(distribution: dist.Distribution) -> FisherInformation:
     """Fisher information of one reading about the parameters of its distribution."""
     shape = distribution.batch_shape
-    distribution = _unwrapped(distribution)
+    distribution = unwrapped(distribution)
     formula = _FORMULAS.get(type(distribution))
     if formula is None:
         what = f"the Fisher information of {type(distribution).__name__} is not known"
@@ -70,15 +71,6 @@ def information(distribution: dist.Distribution) -> FisherInformation:
         tuple(jnp.broadcast_to(x, shape) for x in parameters),
         jnp.broadcast_to(matrix, (*shape, size, size)),
     )
-
-
-def _unwrapped(distribution: dist.Distribution) -> dist.Distribution:
-    """A distribution without masks, expansions and event dimensions around it."""
-    while isinstance(
-        distribution, dist.MaskedDistribution | dist.ExpandedDistribution | dist.Independent
-    ):
-        distribution = distribution.base_dist
-    return distribution
 
 
 def _symmetric(first: Array, across: Array, second: Array) -> Array:
@@ -196,7 +188,7 @@ def reading_information(
         for name in program.observed:
             distribution = trace[name]["fn"]
             found = information(distribution)
-            is_beta = isinstance(_unwrapped(distribution), MeanConcentrationBeta)
+            is_beta = isinstance(unwrapped(distribution), MeanConcentrationBeta)
             parameters[name] = jnp.stack(found.parameters, axis=-1)
             aux[name] = found.information, found.parameters[1] if is_beta else None
         return parameters, aux

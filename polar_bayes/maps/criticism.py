@@ -9,9 +9,9 @@ import dataclasses
 import enum
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from numpyro import distributions as dist
 
 from polar_bayes.inference.batching import ObservationBatch, Status
@@ -72,7 +72,7 @@ class Scalar:
     name: str
     index: tuple[int, ...]
 
-    def of(self, values: Mapping[str, Any]) -> np.ndarray:
+    def of(self, values: Mapping[str, ArrayLike]) -> np.ndarray:
         """Its values, (..., pixel) or (pixel, draw), among those of all parameters."""
         found = np.asarray(values[self.name])
         return found[(slice(None),) * (found.ndim - len(self.index)) + self.index]
@@ -160,9 +160,8 @@ def _bounds(
             if absent is None or absent.value != bound:
                 draws = scalar.of(engine.prior_parameters)[None]
                 strip = NEAR_BOUND * np.diff(np.quantile(draws, CENTRAL_95))
-                if _share_at(bound, draws, np.full((1, MOMENTS), 1.0 / MOMENTS), strip) < (
-                    MASS_AT_BOUND
-                ):
+                weights = np.full((1, MOMENTS), 1.0 / MOMENTS)
+                if _share_at(bound, draws, weights, strip) < MASS_AT_BOUND:
                     yield Bound(scalar, bound)
 
 

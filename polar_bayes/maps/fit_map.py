@@ -5,7 +5,6 @@ import enum
 import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import dask.array as da
 import jax
@@ -61,8 +60,6 @@ DIAGNOSTICS = {
     "approach": "method by which the numbers were found",
     "status": "status of the pixel",
 }
-
-FLAGS: dict[str, type[enum.IntEnum]] = {"approach": MethodUsed, "status": Status}
 
 FILL_VALUES = {"status": int(Status.NOT_FITTED), "criticism": UNKNOWN}
 """Of chunks in a Zarr store that are not written."""
@@ -152,7 +149,7 @@ class MapPlan:
     own_directions: frozenset[str] = dataclasses.field(compare=False)
     shared: tuple[SharedParameter, ...] = ()
     shares_by_default: bool = dataclasses.field(default=False, compare=False)
-    found: Mapping[str, Any] = dataclasses.field(default_factory=dict, compare=False)
+    found: Mapping[str, object] = dataclasses.field(default_factory=dict, compare=False)
 
     def sharing(self, names: Sequence[str]) -> "MapPlan":
         """The same request, where pixels share these parameters."""
@@ -369,7 +366,7 @@ def provenance_json(plan: MapPlan) -> str:
     return json.dumps(provenance, sort_keys=True)
 
 
-def _described(parameter: SharedParameter, request: Request) -> dict[str, Any]:
+def _described(parameter: SharedParameter, request: Request) -> dict[str, object]:
     """A shared parameter in what JSON can hold."""
     with jax.enable_x64(True):
         quantiles = parameter.quantiles(request.priors[parameter.name], LEVELS)
@@ -471,7 +468,7 @@ def maps_of(
 ) -> xr.Dataset:
     """The marginals of a block, and how they are judged, as labeled maps."""
     shape = tuple(block.sizes[dim] for dim in IMAGE)
-    variables: dict[str, Any] = {}
+    variables: dict[str, tuple] = {}
     for name, (own, sizes) in plan.axes.items():
         symbol, meaning, unit = notation(name)
         statistics = [
@@ -486,23 +483,21 @@ def maps_of(
             whole = values.reshape(*values.shape[: len(first)], *shape, *sizes)
             labels = {"units": unit, "long_name": f"{statistic} {meaning}", "symbol": symbol}
             variables[f"{name}{ending}"] = ((*first, *IMAGE, *own), np.float32(whole), labels)
+    kinds: dict[str, type[enum.IntEnum]] = {"approach": MethodUsed, "status": Status}
     for name, meaning in DIAGNOSTICS.items():
-        attrs: dict[str, Any] = {"units": "1", "long_name": meaning}
-        if name in FLAGS:
-            flags = list(FLAGS[name])
-            attrs = {
-                "long_name": meaning,
-                "flag_values": [int(each) for each in flags],
-                "flag_meanings": " ".join(each.name.lower() for each in flags),
-            }
+        attrs: dict[str, object] = {"units": "1", "long_name": meaning}
+        if name in kinds:
+            attrs = _flag_attrs(meaning, "flag_values", kinds[name])
         variables[name] = (IMAGE, getattr(outcome, name).reshape(shape), attrs)
-    attrs = {
-        "long_name": "checks in which the readings speak against the model",
-        "flag_masks": [int(each) for each in Criticism],
-        "flag_meanings": " ".join(str(each.name).lower() for each in Criticism),
-    }
+    checks = "checks in which the readings speak against the model"
+    attrs = _flag_attrs(checks, "flag_masks", Criticism)
     variables["criticism"] = (IMAGE, criticism.reshape(shape), attrs)
     coords = {dim: block.coords[dim] for dim in (*IMAGE, "wavelength") if dim in block.coords}
     found_maps = xr.Dataset(variables, coords={**coords, "quantile": list(LEVELS)})
     names = [each.name for each in plan.shared]
     return found_maps.assign_coords(shared=names) if names else found_maps
+
+
+def _flag_attrs(meaning: str, key: str, kind: type[enum.IntEnum]) -> dict[str, object]:
+    names = " ".join(each.name.lower() for each in kind)
+    return {"long_name": meaning, key: [int(each) for each in kind], "flag_meanings": names}

@@ -23,13 +23,6 @@ from polar_bayes.inference.batching import IMAGE, Status, cut
 from polar_bayes.inference.result import CENTRAL_95
 from polar_bayes.maps.lazy import CHUNK, checked_status, map_parameters
 
-LARGEST_PULL = 0.5
-"""Of the priors of all pixels together on the mean of a region, in units of its sd, above which
-it is told: where pixels are alike, a 95% interval that is moved so far holds in 92%."""
-
-SIGNIFICANT = 3.0
-"""Standard errors from which a pull is not chance."""
-
 
 class _Sums(NamedTuple):
     """Of one parameter over the pixels of every region: each (region, ...)."""
@@ -256,7 +249,8 @@ def _of_regions(sums: _Sums, count: np.ndarray, reference: int | None) -> _Sums:
 def _cautions(name: str, labels: np.ndarray, found: _Sums, shown: np.ndarray) -> Iterator[str]:
     """Where an interval would not hold if all pixels of a region were alike."""
     pull, chance, sd = np.abs(found.pull), np.sqrt(found.pull_variance), found.sd
-    is_moved = (pull > LARGEST_PULL * sd) & (pull > SIGNIFICANT * chance)
+    # Where pixels are alike, a 95% interval that is moved by half an sd holds in 92%.
+    is_moved = (pull > 0.5 * sd) & (pull > 3.0 * chance)
     is_known = found.is_pull_known
     for at in shown:
         if not np.all(is_known[at]):
