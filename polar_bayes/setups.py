@@ -117,10 +117,6 @@ def default_priors(setup: Setup, capture: xr.Dataset) -> dict[str, dist.Distribu
     return {name: prior for name, prior in priors.items() if name in setup.scene.parameters}
 
 
-DRAWS = 10_000
-LEVELS = (0.025, 0.5, 0.975)
-
-
 def prior_table(
     scene: str | Scene | Setup | None = None,
     *,
@@ -144,8 +140,8 @@ def prior_table(
     rows = {}
     own = find_setup(scene).priors if isinstance(scene, str | Setup) else {}
     for name, prior in resolve_priors(_names(scene, priors), {**own, **(priors or {})}).items():
-        draws = np.asarray(prior.sample(jax.random.key(0), (DRAWS,)))
-        levels = np.quantile(draws, LEVELS).tolist()
+        draws = np.asarray(prior.sample(jax.random.key(0), (10_000,)))
+        levels = np.quantile(draws, (0.025, 0.5, 0.975)).tolist()
         rows[name] = [*notation(name), describe_prior(prior), *levels]
     columns = ["symbol", "meaning", "unit", "prior", "q2.5", "q50", "q97.5"]
     return PrintedFrame.from_dict(rows, orient="index", columns=columns)

@@ -57,15 +57,13 @@ class Material:
         Returns:
             Scalars for what color does not change, (wavelength,) for the rest.
         """
-
-        def spectral(values: tuple[float, ...]) -> np.ndarray:
-            return np.interp(wavelengths, REFERENCE_WAVELENGTHS, values)
-
         return {
             "roughness": np.asarray(self.roughness),
             "subsurface_fraction": np.asarray(self.subsurface_fraction),
-            "absorption": spectral(self.absorption),
-            "refractive_index": spectral(self.refractive_index),
+            "absorption": np.interp(wavelengths, REFERENCE_WAVELENGTHS, self.absorption),
+            "refractive_index": np.interp(
+                wavelengths, REFERENCE_WAVELENGTHS, self.refractive_index
+            ),
         }
 
 
@@ -165,8 +163,7 @@ def checked_parameters(
     scene: Scene, material: Material, wavelengths: np.ndarray, overrides: Mapping[str, Value]
 ) -> dict[str, np.ndarray]:
     """A value for every parameter of the scene."""
-    unknown = set(overrides) - set(scene.parameters)
-    if unknown:
+    if unknown := set(overrides) - set(scene.parameters):
         what = f"the scene has no parameter {', '.join(sorted(unknown))}"
         hint = f"give any of {', '.join(scene.parameters)}"
         raise SceneError(what, where="simulate: parameters", hint=hint)
@@ -197,8 +194,7 @@ def checked_noise(
 ) -> dict[str, np.ndarray | None]:
     """A value for every noise parameter of the links."""
     parameters = noise_parameters(links)
-    unknown = set(overrides) - set(parameters)
-    if unknown:
+    if unknown := set(overrides) - set(parameters):
         what = f"no link reads {', '.join(sorted(unknown))}"
         raise FitError(what, where="simulate: noise", hint=f"give any of {', '.join(parameters)}")
     given: dict[str, Value | None] = {"exposure": None, **defaults, **overrides}
@@ -273,16 +269,6 @@ IMAGE = ("y", "x")
 
 STATED_ERROR = 0.01
 """Standard error that the instrument states of every reading, for the links that read it."""
-
-FULL_SCALE = 1.0
-BRIGHT_QUANTILE = 0.9
-BRIGHT_LEVEL = 0.6
-"""Exposure puts the 90% brightest view at 60% of full scale; a specular lobe may saturate."""
-LARGEST_CONTRAST = 1e4
-"""Brightest view over the 90% brightest one beyond which the brightest one sets the exposure.
-
-Outside its highlight a bare mirror is black: no camera exposes for what is left of a lobe there.
-"""
 
 
 def simulate(
@@ -387,8 +373,10 @@ def _record(
     prediction = scene.predict(parameters, layout.geometry)
     prediction = {n: jnp.broadcast_to(x, layout.shape) for n, x in prediction.items()}
     light = prediction["intensity"]
-    brightest = jnp.max(light) / LARGEST_CONTRAST
-    exposure = BRIGHT_LEVEL / jnp.maximum(jnp.quantile(light, BRIGHT_QUANTILE), brightest)
+    # Exposure puts the 90% brightest view at 60% of full scale; a specular lobe may saturate.
+    # Outside its highlight a bare mirror is black: no camera exposes for what is left of a lobe
+    # there, so that the brightest view sets the exposure if its contrast is larger than 1e4.
+    exposure = 0.6 / jnp.maximum(jnp.quantile(light, 0.9), jnp.max(light) / 1e4)
     levels = {
         name: exposure if level is None else jnp.asarray(_align_image(level, axes))
         for name, level in noise.items()
@@ -398,14 +386,9 @@ def _record(
     if "intensity" in links:
         link = links["intensity"]
         intensity = link.distribution("intensity", prediction, layout, levels).sample(key_intensity)
-        intensity = jnp.clip(intensity, 0.0, FULL_SCALE)
-        recorded["intensity"] = intensity
-        recorded["saturated"] = intensity >= FULL_SCALE
-        data = dataclasses.replace(
-            layout,
-            brightness=jnp.clip(intensity / FULL_SCALE, 0.0, 1.0),
-            saturated=recorded["saturated"],
-        )
+        intensity = jnp.clip(intensity, 0.0, 1.0)  # of full scale
+        recorded |= {"intensity": intensity, "saturated": intensity >= 1.0}
+        data = dataclasses.replace(layout, brightness=intensity, saturated=recorded["saturated"])
     for name, key in zip(links, jax.random.split(key_rest, len(links)), strict=True):
         if name != "intensity":
             recorded[name] = links[name].distribution(name, prediction, data, levels).sample(key)
@@ -447,7 +430,7 @@ def _layout(
         readings={},
         errors={name: jnp.full(shape, STATED_ERROR) for name in links},
         brightness=jnp.ones(shape),
-        full_scale=jnp.asarray(FULL_SCALE),
+        full_scale=jnp.asarray(1.0),
         intensity_unit=jnp.asarray(1.0),
         valid=jnp.ones(shape, bool),
         saturated=jnp.zeros(shape, bool),
@@ -475,5 +458,5 @@ def _label(
     if protocol.wavelengths:
         capture = capture.assign_coords(wavelength=np.asarray(protocol.wavelengths, float))
     if "intensity" in capture:
-        capture["intensity"].attrs["saturation_level"] = FULL_SCALE
+        capture["intensity"].attrs["saturation_level"] = 1.0
     return validate(capture, source="simulate")

@@ -56,7 +56,7 @@ class Part(HTMLRepr, abc.ABC):
                 names.append(value)
         return tuple(dict.fromkeys(names))
 
-    def _values(self) -> Iterator[tuple[str, Range | None, Any]]:
+    def _values(self) -> Iterator[tuple[str, Range | None, object]]:
         """Every field with its range and its value, or each value of its tuple."""
         for field in dataclasses.fields(self):
             notes = getattr(field.type, "__metadata__", ())
