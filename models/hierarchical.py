@@ -11,7 +11,7 @@ scale.
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -22,6 +22,8 @@ from numpyro import distributions as dist
 
 from polar_bayes.errors import FitError
 from polar_bayes.models.sites import (
+    Links,
+    Priors,
     SoftClip,
     constant_axes,
     declare_readings,
@@ -31,7 +33,6 @@ from polar_bayes.models.sites import (
     over_axes,
 )
 from polar_bayes.observation.data import Observations
-from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 from polar_bayes.priors import RANGES, support_bounds
 from polar_bayes.repr_html import HTMLRepr
@@ -72,7 +73,7 @@ def natural_scale(name: str, location: dist.Distribution) -> Scale:
 def draw_pooled(
     name: str,
     data: Observations,
-    priors: Mapping[str, dist.Distribution],
+    priors: Priors,
     *,
     without: tuple[str, ...],
 ) -> Float[Array, "..."]:
@@ -144,13 +145,7 @@ class Hierarchical(HTMLRepr):
             hint = "name a parameter, or use model='per_material'"
             raise FitError("nothing is pooled", where="Hierarchical", hint=hint)
 
-    def __call__(
-        self,
-        data: Observations,
-        scene: Scene,
-        priors: Mapping[str, dist.Distribution],
-        links: Mapping[str, AbstractLink],
-    ) -> None:
+    def __call__(self, data: Observations, scene: Scene, priors: Priors, links: Links) -> None:
         """Declare the generative model of a capture with a leading axis (patch or material)."""
         check_members(self.pooled, data, scene)
         parameters = {}

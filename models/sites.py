@@ -17,6 +17,9 @@ from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink, noise_parameters
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 
+Priors = Mapping[str, dist.Distribution]
+Links = Mapping[str, AbstractLink]
+
 SPECTRAL = ("absorption", "refractive_index")
 """Parameters with one value per wavelength."""
 
@@ -36,9 +39,7 @@ def material_parameters(scene: Scene) -> tuple[str, ...]:
     return tuple(name for name in MATERIAL_PARAMETERS if name in scene.parameters)
 
 
-def draw_independent(
-    name: str, data: Observations, priors: Mapping[str, dist.Distribution]
-) -> Float[Array, "..."]:
+def draw_independent(name: str, data: Observations, priors: Priors) -> Float[Array, "..."]:
     """Sample a parameter of the material independently for each patch, or wavelength."""
     with over_axes(data, without=constant_axes(name)):
         return draw(name, priors[name], data)
@@ -142,8 +143,8 @@ def declare_readings(
     parameters: Mapping[str, Array],
     data: Observations,
     scene: Scene,
-    priors: Mapping[str, dist.Distribution],
-    links: Mapping[str, AbstractLink],
+    priors: Priors,
+    links: Links,
 ) -> None:
     """Declare instrument, noise, and the likelihood of the readings around eq. 1."""
     # The instrument and the noise: one value for the whole capture, shared by all its patches.

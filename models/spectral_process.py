@@ -16,6 +16,9 @@ from polar_bayes.observation.data import Observations
 from polar_bayes.physics.scene import Scene
 from polar_bayes.repr_html import HTMLRepr
 
+Knots = Float[Array, " knots"]
+Wavelengths = Float[Array, " wavelength"]
+
 KERNELS = ("Exp", "ExpSquared", "Matern32", "Matern52")
 """The decaying kernels of tinygp whose only parameter is a length."""
 
@@ -84,24 +87,22 @@ class SpectralProcess(HTMLRepr):
         """False where the kernel is an object, which has a length of its own."""
         return not isinstance(self.kernel, kernels.Kernel)
 
-    def knot_wavelengths(self, wavelength: Float[Array, " wavelength"]) -> Float[Array, " knots"]:
+    def knot_wavelengths(self, wavelength: Wavelengths) -> Knots:
         """The knots of these measured wavelengths in ascending order, nm."""
         if wavelength.size <= self.knots:
             return jnp.sort(wavelength)
         return jnp.linspace(jnp.min(wavelength), jnp.max(wavelength), self.knots)
 
-    def scales(
-        self, length: Float[Array, ""] | None, knot_wavelengths: Float[Array, " knots"]
-    ) -> Float[Array, " knots"]:
+    def scales(self, length: Array | None, knot_wavelengths: Knots) -> Knots:
         """How much each weight moves the values at the knots, given those before it. 1, > 0."""
         return jnp.diag(self._factor(length, knot_wavelengths))
 
     def values(
         self,
         weights: Float[Array, "... knots"],
-        length: Float[Array, ""] | None,
-        knot_wavelengths: Float[Array, " knots"],
-        wavelength: Float[Array, " wavelength"],
+        length: Array | None,
+        knot_wavelengths: Knots,
+        wavelength: Wavelengths,
     ) -> Float[Array, "... wavelength"]:
         """The process at any wavelengths, as far as its knots determine it.
 
@@ -117,10 +118,7 @@ class SpectralProcess(HTMLRepr):
         return weights @ self._across(length, knot_wavelengths, wavelength)
 
     def remainder(
-        self,
-        length: Float[Array, ""] | None,
-        knot_wavelengths: Float[Array, " knots"],
-        wavelength: Float[Array, " wavelength"],
+        self, length: Array | None, knot_wavelengths: Knots, wavelength: Wavelengths
     ) -> Float[Array, "wavelength wavelength"]:
         """Lower Cholesky factor of the covariance that the knots leave undetermined.
 
@@ -141,9 +139,8 @@ class SpectralProcess(HTMLRepr):
 
     def _across(self, length: Array | None, knot_wavelengths: Array, wavelength: Array) -> Array:
         """What each weight does to the values at these wavelengths: (knots, wavelength)."""
-        turned = _polynomials(knot_wavelengths).T @ self._matrix(
-            length, knot_wavelengths, wavelength
-        )
+        across = self._matrix(length, knot_wavelengths, wavelength)
+        turned = _polynomials(knot_wavelengths).T @ across
         return solve_triangular(self._factor(length, knot_wavelengths), turned, lower=True)
 
     def _factor(self, length: Array | None, knot_wavelengths: Array) -> Array:
@@ -202,7 +199,7 @@ def spectrum_around(
     return SoftClip(*bounds)(level + amplitude * departure)
 
 
-def weight_scale(name: str, scales: Float[Array, " knots"]) -> Float[Array, " knots"]:
+def weight_scale(name: str, scales: Knots) -> Knots:
     r"""By how much weights are widened before they are sampled.
 
     $$ \sqrt{1 + (s_j/\sigma)^2}, \quad \text{and 1 for the last} $$
@@ -220,7 +217,7 @@ def weight_scale(name: str, scales: Float[Array, " knots"]) -> Float[Array, " kn
     return jnp.sqrt(1.0 + (scales / TYPICAL_ERROR[name]) ** 2).at[-1].set(1.0)
 
 
-def wavelengths_of(data: Observations) -> Float[Array, " wavelength"]:
+def wavelengths_of(data: Observations) -> Wavelengths:
     """The wavelengths of a capture, nm."""
     wavelength = data.geometry.wavelength
     assert wavelength is not None  # `check_capture` has seen the axis
@@ -229,11 +226,8 @@ def wavelengths_of(data: Observations) -> Float[Array, " wavelength"]:
 
 def check_spectra(coupled: object) -> None:
     """Refuse what is no choice of spectra."""
-    if (
-        not isinstance(coupled, tuple)
-        or not coupled
-        or len(set(coupled)) != len(coupled)
-        or not set(coupled) <= set(SPECTRA)
+    if not (
+        isinstance(coupled, tuple) and 0 < len(coupled) == len(set(coupled).intersection(SPECTRA))
     ):
         hint = f"give a tuple of one or both of {', '.join(SPECTRA)}"
         raise FitError(f"coupled={coupled!r} names no spectra", where="GpSpectral", hint=hint)

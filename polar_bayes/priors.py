@@ -178,11 +178,7 @@ class Beta(dist.Beta):
     # priors would start JAX on import and stay in single precision. Here they are Python numbers.
 
     def __init__(
-        self,
-        concentration1: float,
-        concentration0: float,
-        *,
-        validate_args: bool | None = None,
+        self, concentration1: float, concentration0: float, *, validate_args: bool | None = None
     ) -> None:
         self.concentration1, self.concentration0 = concentration1, concentration0
         dist.Distribution.__init__(self, validate_args=validate_args)
@@ -581,11 +577,7 @@ PRIORS = Priors(_ROWS)
 """Default prior of each parameter, by its name."""
 
 ANGLE_ZERO: Mapping[str, dist.Distribution] = MappingProxyType(
-    {
-        "stage": dist.Normal(0.0, 0.2),
-        "hand": PRIORS["angle_zero"],
-        "lens": dist.Normal(0.0, 3.0),
-    }
+    {"stage": dist.Normal(0.0, 0.2), "hand": PRIORS["angle_zero"], "lens": dist.Normal(0.0, 3.0)}
 )
 """Prior of `angle_zero`, degree, by how the angles were set: by a rotary stage, by hand, or read
 from a picture through the geometry of its lens. What is not stated counts as by hand."""

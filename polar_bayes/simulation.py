@@ -27,8 +27,6 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import RANGES
 from polar_bayes.setups import SETUPS, Setup, find_setup, setup_name
 
-__all__ = ["PRESETS", "Material", "Protocol", "simulate"]
-
 REFERENCE_WAVELENGTHS = (450.0, 550.0, 650.0)
 
 
@@ -57,13 +55,11 @@ class Material:
         Returns:
             Scalars for what color does not change, (wavelength,) for the rest.
         """
+        spectra = {"absorption": self.absorption, "refractive_index": self.refractive_index}
         return {
             "roughness": np.asarray(self.roughness),
             "subsurface_fraction": np.asarray(self.subsurface_fraction),
-            "absorption": np.interp(wavelengths, REFERENCE_WAVELENGTHS, self.absorption),
-            "refractive_index": np.interp(
-                wavelengths, REFERENCE_WAVELENGTHS, self.refractive_index
-            ),
+            **{n: np.interp(wavelengths, REFERENCE_WAVELENGTHS, x) for n, x in spectra.items()},
         }
 
 

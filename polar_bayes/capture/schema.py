@@ -371,11 +371,7 @@ def dims_text(dims: Iterable[Hashable]) -> str:
 
 
 def _entries(
-    dataset: xr.Dataset,
-    row: Variable,
-    layout: Layout,
-    source: str,
-    valid: np.ndarray | bool = True,
+    dataset: xr.Dataset, row: Variable, layout: Layout, source: str, valid: np.ndarray | bool = True
 ) -> xr.Variable:
     """A variable of the contract in canonical form; readings that are not valid are not checked."""
     variable = _ordered(dataset[row.name].variable, row, layout, source)

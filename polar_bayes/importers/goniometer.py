@@ -136,10 +136,7 @@ def _refuse_swapped(capture: xr.Dataset) -> None:
 
 
 def _channels(
-    s: Readings | None,
-    p: Readings | None,
-    table: str | os.PathLike[str] | None,
-    angle: str | None,
+    s: Readings | None, p: Readings | None, table: str | os.PathLike[str] | None, angle: str | None
 ) -> tuple["Channel", "Channel", list[Path]]:
     """Both channels, and the files that they come from."""
     if table is None:

@@ -29,13 +29,7 @@ import numpy as np
 import xarray as xr
 
 from polar_bayes.capture.combine import DIMS, PER_VIEW, combine
-from polar_bayes.capture.schema import (
-    CONTRACT,
-    WAVELENGTH,
-    hint_for,
-    nearest_name,
-    validate,
-)
+from polar_bayes.capture.schema import CONTRACT, WAVELENGTH, hint_for, nearest_name, validate
 from polar_bayes.errors import CaptureError
 from polar_bayes.paths import existing_file, system_error
 

@@ -31,12 +31,7 @@ from polar_bayes.inference.prior_probability import has_probabilities, probabili
 from polar_bayes.inference.problem_batch import BatchDraws
 from polar_bayes.inference.program import Values
 from polar_bayes.inference.result import CENTRAL_95
-from polar_bayes.maps.residuals import (
-    Fitted,
-    direction_kernels,
-    fitted_readings,
-    residual_tail,
-)
+from polar_bayes.maps.residuals import Fitted, direction_kernels, fitted_readings, residual_tail
 from polar_bayes.numerics.psis import LEVELS, Marginals
 from polar_bayes.observation.links import PERFECT
 from polar_bayes.physics.part import absence

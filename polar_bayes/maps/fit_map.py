@@ -25,12 +25,7 @@ from polar_bayes.inference.batching import (
     cut,
 )
 from polar_bayes.inference.compiled_model import CompiledModel, compile_layout, layout_key
-from polar_bayes.inference.problem_batch import (
-    Outcome,
-    ProblemBatch,
-    empty_outcome,
-    problem_batch,
-)
+from polar_bayes.inference.problem_batch import Outcome, ProblemBatch, empty_outcome, problem_batch
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.maps.blocks import as_completed, workers

@@ -39,6 +39,8 @@ __all__ = [
     "StudentTLink",
 ]
 
+PerView = Float[Array, "... view"]
+
 # --- Noise against brightness and view angle (the paper's section 2) ------------------------------
 
 
@@ -73,12 +75,7 @@ class ConcentrationSchedule(HTMLRepr):
         _check_range(self, "brightness_exponent", 0.0, 1.0)
         _check_range(self, "angle_exponent", 0.0, 2.0)
 
-    def concentration(
-        self,
-        scale: Float[Array, "..."],
-        brightness: Float[Array, "... view"],
-        cos_view: Float[Array, "... view"],
-    ) -> Float[Array, "... view"]:
+    def concentration(self, scale: Array, brightness: PerView, cos_view: PerView) -> PerView:
         """The concentration of each view, at least `minimum`; brightness is the recorded one."""
         gain = brightness**self.brightness_exponent * cos_view**self.angle_exponent
         return self.minimum + scale * gain
@@ -115,12 +112,7 @@ class ScaleSchedule(HTMLRepr):
         _check_range(self, "least_headroom", 1e-6, 1.0)
         _check_range(self, "least_cosine", 1e-6, 1.0)
 
-    def scale(
-        self,
-        base: Float[Array, "..."],
-        brightness: Float[Array, "... view"],
-        cos_view: Float[Array, "... view"],
-    ) -> Float[Array, "... view"]:
+    def scale(self, base: Array, brightness: PerView, cos_view: PerView) -> PerView:
         """The scale of each view, at least `base`; brightness is the predicted one."""
         # A smooth bound: a corner here would put a corner, not a peak, on top of the posterior
         # whenever a view is predicted close to full scale.
@@ -133,16 +125,12 @@ class ScaleSchedule(HTMLRepr):
         return base * growth * cosine**-self.angle_exponent
 
 
-def precision_by_confidence(
-    precision: Float[Array, "..."], confidence: Float[Array, "... view"] | None
-) -> Float[Array, "..."]:
+def precision_by_confidence(precision: Array, confidence: PerView | None) -> Array:
     """A precision, times the confidence in the stated normal."""
     return precision if confidence is None else precision * confidence
 
 
-def scale_by_confidence(
-    scale: Float[Array, "..."], confidence: Float[Array, "... view"] | None
-) -> Float[Array, "..."]:
+def scale_by_confidence(scale: Array, confidence: PerView | None) -> Array:
     """A scale of noise, over the square root of the confidence in the stated normal."""
     return scale if confidence is None else scale / jnp.sqrt(confidence)
 
@@ -157,7 +145,7 @@ def _check_range(owner: object, field: str, low: float, high: float, note: str =
 # --- Links ----------------------------------------------------------------------------------------
 
 
-Prediction = Mapping[str, Float[Array, "... view"]]
+Prediction = Mapping[str, PerView]
 Noise = Mapping[str, Float[Array, ""]]
 
 
@@ -191,11 +179,11 @@ class AbstractLink(HTMLRepr, abc.ABC):
             A NumPyro distribution of batch shape (..., view).
         """
 
-    def center(self, name: str, prediction: Prediction, noise: Noise) -> Float[Array, "... view"]:
+    def center(self, name: str, prediction: Prediction, noise: Noise) -> PerView:
         """The reading without noise, in the unit of the reading."""
         return prediction[name]
 
-    def reading(self, value: Float[Array, "... view"]) -> Float[Array, "... view"]:
+    def reading(self, value: PerView) -> PerView:
         """The reading as the distribution takes it; unchanged unless a link says otherwise."""
         return value
 
@@ -213,11 +201,11 @@ class _DopLink(AbstractLink):
             raise FitError(f"margin is {self.margin}", where=type(self).__name__, hint=hint)
 
     @override
-    def reading(self, value: Float[Array, "... view"]) -> Float[Array, "... view"]:
+    def reading(self, value: PerView) -> PerView:
         # Readings of exactly 0 or 1 have density 0 or infinity; fits count how many there are.
         return jnp.clip(value, self.margin, 1.0 - self.margin)
 
-    def _mean(self, prediction: Prediction) -> Float[Array, "... view"]:
+    def _mean(self, prediction: Prediction) -> PerView:
         return jnp.clip(prediction["dop"], self.margin, 1.0 - self.margin)
 
 
@@ -363,9 +351,7 @@ class StokesLink(AbstractLink):
         freedom = jnp.asarray(self.degrees_of_freedom, jnp.result_type(scale))
         return dist.StudentT(freedom, location, scale)
 
-    def _brightness(
-        self, prediction: Prediction, data: Observations, noise: Noise
-    ) -> Float[Array, "... view"]:
+    def _brightness(self, prediction: Prediction, data: Observations, noise: Noise) -> PerView:
         """The light of each view over full scale, by which its polarization is known."""
         brightness = data.brightness
         if "exposure" in noise:
@@ -405,7 +391,7 @@ class StudentTLink(AbstractLink):
         _check_range(self, "degrees_of_freedom", 3.0, 7.0, ", the paper's range of nu")
 
     @override
-    def center(self, name: str, prediction: Prediction, noise: Noise) -> Float[Array, "... view"]:
+    def center(self, name: str, prediction: Prediction, noise: Noise) -> PerView:
         return noise["exposure"] * prediction[name]
 
     @override

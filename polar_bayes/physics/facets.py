@@ -36,12 +36,7 @@ from polar_bayes.physics.geometry import (
     per_facet,
     sin_degrees,
 )
-from polar_bayes.physics.microfacet import (
-    AbstractMicrofacet,
-    AbstractShadowing,
-    Axes,
-    SlopeEllipse,
-)
+from polar_bayes.physics.microfacet import AbstractMicrofacet, AbstractShadowing, Axes, SlopeEllipse
 from polar_bayes.physics.part import Part, quotient, unit_rule
 from polar_bayes.physics.stokes import Light
 

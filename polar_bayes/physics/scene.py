@@ -296,9 +296,7 @@ _FULL_SURFACE = RoughSurface(
 
 FULL_SCENES: dict[str, Scene] = {
     "paper": dataclasses.replace(
-        SCENES["paper"],
-        surface=_FULL_SURFACE,
-        instrument=Instrument((AngleZero(), DarkLevel())),
+        SCENES["paper"], surface=_FULL_SURFACE, instrument=Instrument((AngleZero(), DarkLevel()))
     ),
     "camera": dataclasses.replace(
         SCENES["camera"],

@@ -28,13 +28,7 @@ from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.facets import Facets, seen
-from polar_bayes.physics.geometry import (
-    Geometry,
-    cos_degrees,
-    double_angle,
-    per_facet,
-    sin_degrees,
-)
+from polar_bayes.physics.geometry import Geometry, cos_degrees, double_angle, per_facet, sin_degrees
 from polar_bayes.physics.illumination import PointSource, UniformSky
 from polar_bayes.physics.microfacet import SlopeEllipse
 from polar_bayes.physics.part import Parameters, Part, at_least, quotient

@@ -149,10 +149,7 @@ class LinearPolarization(Part):
 
 
 def mirror_light(
-    stack: Stack,
-    facet: MirrorFacet,
-    geometry: Geometry,
-    incident: tuple[Array, Array] | None,
+    stack: Stack, facet: MirrorFacet, geometry: Geometry, incident: tuple[Array, Array] | None
 ) -> Light:
     """Light that one facet mirrors to the viewer."""
     mean, power = stack.mirror(facet.cos_incidence, facet.sin_squared)

@@ -9,15 +9,7 @@ from jaxtyping import Array
 
 from polar_bayes.physics.geometry import Geometry, cos_degrees, per_ray, sin_degrees
 from polar_bayes.physics.half_space import CLEAREST, Ray, refract, scatter
-from polar_bayes.physics.part import (
-    Parameters,
-    Part,
-    Range,
-    Setting,
-    at_least,
-    quotient,
-    value_of,
-)
+from polar_bayes.physics.part import Parameters, Part, Range, Setting, at_least, quotient, value_of
 from polar_bayes.physics.phase_function import AbstractPhaseFunction, Isotropic
 from polar_bayes.physics.stokes import Light
 from polar_bayes.physics.surface import Interface, InternalReflection
