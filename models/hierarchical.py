@@ -71,11 +71,7 @@ def natural_scale(name: str, location: dist.Distribution) -> Scale:
 
 
 def draw_pooled(
-    name: str,
-    data: Observations,
-    priors: Priors,
-    *,
-    without: tuple[str, ...],
+    name: str, data: Observations, priors: Priors, *, without: tuple[str, ...]
 ) -> Float[Array, "..."]:
     r"""Sample one parameter of every patch from a common population.
 

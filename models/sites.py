@@ -140,19 +140,12 @@ class SoftClip(Transform):
 
 
 def declare_readings(
-    parameters: Mapping[str, Array],
-    data: Observations,
-    scene: Scene,
-    priors: Priors,
-    links: Links,
+    parameters: Mapping[str, Array], data: Observations, scene: Scene, priors: Priors, links: Links
 ) -> None:
     """Declare instrument, noise, and the likelihood of the readings around eq. 1."""
     # The instrument and the noise: one value for the whole capture, shared by all its patches.
-    instrument = {
-        name: numpyro.sample(name, priors[name])
-        for name in scene.parameters
-        if name not in parameters
-    }
+    rest = [name for name in scene.parameters if name not in parameters]
+    instrument = {name: numpyro.sample(name, priors[name]) for name in rest}
     noise = {name: numpyro.sample(name, priors[name]) for name in noise_parameters(links)}
 
     parameters = {**parameters, **instrument}

@@ -401,11 +401,8 @@ class _Readable:
 
     def fields(self, values: Mapping[str, object]) -> str:
         """The numeric values among these, as `loc=1, scale=2`."""
-        numbers = {
-            key: np.asarray(value)
-            for key, value in values.items()
-            if not key.startswith("_") and np.asarray(value).dtype.kind in "iuf"
-        }
+        shown = {key: np.asarray(x) for key, x in values.items() if not key.startswith("_")}
+        numbers = {key: x for key, x in shown.items() if x.dtype.kind in "iuf"}
         return ", ".join(f"{key}={self.text(number)}" for key, number in numbers.items())
 
 

@@ -263,20 +263,16 @@ def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
     _check_names(dataset, source)
     layout = _layout(dataset, source)
     present = [row for row in CONTRACT if row.name in dataset]
-    flags = {
-        row.name: _entries(dataset, row, layout, source) for row in present if row.kind == "flag"
-    }
+    flags = [row for row in present if row.kind == "flag"]
+    found = {row.name: _entries(dataset, row, layout, source) for row in flags}
     valid = np.ones([dataset.sizes[dim] for dim in layout.readings], dtype=bool)
-    if "valid" in flags:
-        valid = flags["valid"].values
+    if "valid" in found:
+        valid = found["valid"].values
     if not valid.any():
         hint = "mark what was measured valid=True"
         raise CaptureError("every view is masked", where=f"{source}: valid", hint=hint)
-    numbers = {
-        row.name: _entries(dataset, row, layout, source, valid)
-        for row in present
-        if row.kind != "flag"
-    }
+    rest = [row for row in present if row.kind != "flag"]
+    numbers = {row.name: _entries(dataset, row, layout, source, valid) for row in rest}
     _check_degrees(numbers, source)
     _check_polarization(numbers, layout, valid, source)
     _check_intensity_units(numbers, source)
@@ -284,16 +280,10 @@ def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
     if dataset.attrs.get("angle_set_by", "hand") not in ("stage", "hand", "lens"):
         what, hint = "no such way to set an angle", "give one of stage, hand, lens"
         raise CaptureError(what, where=f"{source}: attribute angle_set_by", hint=hint)
-    truths = {
-        str(name): _truth(variable, str(name), layout, source)
-        for name, variable in dataset.variables.items()
-        if TRUTH.fullmatch(str(name))
-    }
-    return xr.Dataset(
-        {**numbers, **flags, **truths},
-        coords=_labels(dataset, layout, source),
-        attrs=clean_attributes(dataset.attrs, source),
-    )
+    names = [str(name) for name in dataset.variables if TRUTH.fullmatch(str(name))]
+    truths = {name: _truth(dataset.variables[name], name, layout, source) for name in names}
+    labels, attributes = _labels(dataset, layout, source), clean_attributes(dataset.attrs, source)
+    return xr.Dataset({**numbers, **found, **truths}, labels, attributes)
 
 
 def count(capture: xr.Dataset) -> dict[str, int]:

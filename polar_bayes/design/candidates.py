@@ -260,10 +260,8 @@ def _checked(capture: xr.Dataset, candidates: xr.Dataset) -> xr.Dataset:
             inside &= (angle >= 0.0) & (angle < 90.0)
         if not inside.all():
             at = int(np.argmin(inside))
-            what, hint = (
-                f"{angle[at]:g} is no direction",
-                "give degrees; a zenith is from 0 to below 90",
-            )
+            what = f"{angle[at]:g} is no direction"
+            hint = "give degrees; a zenith is from 0 to below 90"
             raise FitError(what, where=f"{where}: {name}[view={at}]", hint=hint)
     return candidates
 

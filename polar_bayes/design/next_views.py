@@ -205,9 +205,8 @@ def _selected(
         covariance = design.covariance(information) / np.outer(unit, unit)
         return np.mean(criterion.loss(covariance, names), axis=0)
 
-    allowed = constraints.allows(
-        views.directions, view_directions(request.capture)[: views.measured]
-    )
+    measured = view_directions(request.capture)[: views.measured]
+    allowed = constraints.allows(views.directions, measured)
     allowed &= views.directions[:, 0] <= request.largest_view_zenith
     useful = np.einsum("kvii->v", design.each) > 0.0  # a wavelength that is not measured adds none
     conflicts = design.conflicts(constraints.conflicts(views.directions), constraints.repeatable)

@@ -136,11 +136,8 @@ def profile(
 
 def _find_coordinate(problem: DesignProblem, parameter: str) -> Coordinate:
     """The coordinate of a scalar parameter that is sampled."""
-    known = [
-        each
-        for each in label_coordinates(problem.program, problem.request.capture)
-        if each.is_entry and each.site not in problem.program.auxiliary
-    ]
+    program, every = problem.program, label_coordinates(problem.program, problem.request.capture)
+    known = [each for each in every if each.is_entry and each.site not in program.auxiliary]
     found = [each for each in known if parameter in (each.label, each.site)]
     if len(found) != 1:
         what = f"it has {len(found)} values" if found else "no sampled parameter has that name"

@@ -218,20 +218,17 @@ class Channel:
         """The light above the dark level, over the incident light where that is known."""
         errors = self.error if error is None else np.full_like(self.error, error)
         light = self.light - dark_level
-        self.refuse(
-            light < -3.0 * errors,
-            f"the reading lies below the dark level {dark_level:g}",
-            f"give the right dark_level, or the noise without light as {self.name}_error",
-        )
+        what = f"the reading lies below the dark level {dark_level:g}"
+        hint = f"give the right dark_level, or the noise without light as {self.name}_error"
+        self.refuse(light < -3.0 * errors, what, hint)
         light = np.maximum(light, 0.0)
         full = 1.0
         if incident is not None:
             full = incident - dark_level
-            self.refuse(
-                light > 1.2 * full,  # noise may carry it past one, not this far
-                "more light comes back than went in",
-                f"check the incident levels: {self.name}_incident is {incident:g}",
-            )
+            what = "more light comes back than went in"
+            hint = f"check the incident levels: {self.name}_incident is {incident:g}"
+            # Noise may carry a reflectance past one, not this far.
+            self.refuse(light > 1.2 * full, what, hint)
         return dataclasses.replace(self, light=light / full, error=errors / full)
 
     def at(
@@ -304,28 +301,15 @@ def _sorted(
     angle = np.round(angle.astype(np.float64), 6)  # angles that agree so far are one
     order = np.argsort(angle, kind="stable")
     resolution = np.maximum(step / math.sqrt(12.0), SMALLEST_ERROR)
-    channel = Channel(
-        name,
-        angle[order],
-        reading.astype(np.float64)[order],
-        resolution[order],
-        tuple(sources[k] for k in order),
-    )
-    channel.refuse(
-        ~ZENITH.contains(channel.angle),
-        f"the angle is outside {ZENITH}",
-        "give degrees from the surface normal",
-    )
-    channel.refuse(
-        np.diff(channel.angle, prepend=-1.0) == 0.0,
-        f"{name} was read at this angle before",
-        "average the repeats or keep one",
-    )
-    channel.refuse(
-        np.abs(channel.light) >= LARGEST_READING,
-        "the reading is too large",
-        f"give readings below {LARGEST_READING:g}",
-    )
+    columns = angle[order], reading.astype(np.float64)[order], resolution[order]
+    channel = Channel(name, *columns, tuple(sources[k] for k in order))
+    is_outside, is_repeated = ~ZENITH.contains(columns[0]), np.diff(columns[0], prepend=-1.0) == 0.0
+    what, hint = f"the angle is outside {ZENITH}", "give degrees from the surface normal"
+    channel.refuse(is_outside, what, hint)
+    what, hint = f"{name} was read at this angle before", "average the repeats or keep one"
+    channel.refuse(is_repeated, what, hint)
+    what, hint = "the reading is too large", f"give readings below {LARGEST_READING:g}"
+    channel.refuse(np.abs(columns[1]) >= LARGEST_READING, what, hint)
     return channel
 
 

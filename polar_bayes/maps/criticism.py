@@ -110,13 +110,8 @@ def criteria(engine: CompiledModel, sizes: tuple[tuple[str, tuple[int, ...]], ..
     """The criteria of the parameters that have a map, by their names and sizes."""
     priors = engine.priors
     every = [scalar for name, own in sizes for scalar in _scalars(name, own)]
-    stated = [
-        each
-        for each in every
-        if each.name in priors
-        and not priors[each.name].batch_shape
-        and has_probabilities(priors[each.name])
-    ]
+    known = {n for n, x in priors.items() if not x.batch_shape and has_probabilities(x)}
+    stated = [each for each in every if each.name in known]
     judged = tuple(each for each in stated if each.name not in PERFECT)
     noise = tuple(each for each in stated if each.name in PERFECT)
     return Criteria(

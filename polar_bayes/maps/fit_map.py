@@ -155,11 +155,8 @@ class MapPlan:
 
     def observe(self, capture: xr.Dataset) -> Observations:
         """A block, or one pixel, as arrays."""
-        data = observe(
-            capture,
-            largest_view_zenith=self.request.largest_view_zenith,
-            intensity_unit=self.intensity_unit,
-        )
+        limit, unit = self.request.largest_view_zenith, self.intensity_unit
+        data = observe(capture, largest_view_zenith=limit, intensity_unit=unit)
         priors = jax.tree.map(jnp.asarray, as_priors(self.shared))
         return dataclasses.replace(data, shared=priors)
 
@@ -218,11 +215,8 @@ def plan_map(
         raise CaptureError(what, where=str(capture.attrs.get("name", "capture")), hint=hint)
     pixel, limit = _fullest_pixel(capture), largest_view_zenith
     request = resolve(pixel, model, scene, priors, links, limit, seed, precision)
-    own = frozenset(
-        name
-        for name in (*ANGLES, "normal_confidence")
-        if name in capture and set(IMAGE) & set(capture[name].dims)
-    )
+    known = (name for name in (*ANGLES, "normal_confidence") if name in capture)
+    own = frozenset(name for name in known if set(IMAGE) & set(capture[name].dims))
     unit = _intensity_unit(capture)
     plan = MapPlan("", request, settings, unit, own, shares_by_default=shared is None)
     if shared is None:
@@ -270,10 +264,8 @@ def _with_shared(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
 
 def _sharing_nothing(plan: MapPlan, reason: str) -> MapPlan:
     """The plan in which each pixel has parameters of its own, and why."""
-    names = [each.name for each in plan.shared]
-    return dataclasses.replace(
-        plan.sharing(()), found={"not_shared": {"names": names, "reason": reason}}
-    )
+    told = {"names": [each.name for each in plan.shared], "reason": reason}
+    return dataclasses.replace(plan.sharing(()), found={"not_shared": told})
 
 
 def _with_settings(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
@@ -296,9 +288,8 @@ def _random_pixels(capture: xr.Dataset, seed: int, count: int) -> xr.Dataset:
     found: list[xr.Dataset] = []
     for begin in range(0, order.size, 2 * count):
         y, x = np.unravel_index(order[begin : begin + 2 * count], (rows, columns))
-        some = capture.drop_vars(IMAGE, errors="ignore").isel(
-            y=xr.DataArray(y, dims="x_"), x=xr.DataArray(x, dims="x_")
-        )
+        place = {"y": xr.DataArray(y, dims="x_"), "x": xr.DataArray(x, dims="x_")}
+        some = capture.drop_vars(IMAGE, errors="ignore").isel(place)
         some = mask_missing(some.load().rename(x_="x"))
         some = some.map(lambda v: v.expand_dims("y") if "x" in v.dims else v, keep_attrs=True)
         enough = np.flatnonzero(_count_views(some).transpose(*IMAGE).to_numpy()[0] >= MIN_VIEWS)

@@ -90,12 +90,8 @@ def smooth(maps: xr.Dataset, name: str, neighbor_sd: float, *, seed: int = 0) ->
 def _differences(is_known: np.ndarray) -> scipy.sparse.csr_array:
     """The differences of neighbors that both have an answer, (pair, pixel)."""
     number = np.where(is_known, np.cumsum(is_known).reshape(is_known.shape) - 1, -1)
-    pairs = np.concatenate(
-        [
-            np.stack([number[1:].ravel(), number[:-1].ravel()], axis=1),
-            np.stack([number[:, 1:].ravel(), number[:, :-1].ravel()], axis=1),
-        ]
-    )
+    neighbors = (number[1:], number[:-1]), (number[:, 1:], number[:, :-1])
+    pairs = np.concatenate([np.stack(both, axis=-1).reshape(-1, 2) for both in neighbors])
     pairs = pairs[(pairs >= 0).all(axis=1)]
     rows, signs = np.repeat(np.arange(len(pairs)), 2), np.tile([1.0, -1.0], len(pairs))
     shape = len(pairs), int(is_known.sum())

@@ -233,11 +233,9 @@ class BetaLink(_DopLink):
     def distribution(
         self, name: str, prediction: Prediction, data: Observations, noise: Noise
     ) -> dist.Distribution:
-        concentration = self.schedule.concentration(
-            precision_by_confidence(noise["concentration_scale"], data.confidence),
-            data.brightness,
-            cos_degrees(data.geometry.view_zenith),
-        )
+        scale = precision_by_confidence(noise["concentration_scale"], data.confidence)
+        cos_view = cos_degrees(data.geometry.view_zenith)
+        concentration = self.schedule.concentration(scale, data.brightness, cos_view)
         return MeanConcentrationBeta(self._mean(prediction), concentration, self.margin)
 
 
@@ -263,9 +261,8 @@ class LogitNormalLink(_DopLink):
         mean = self._mean(prediction)
         log_odds = jnp.log(mean) - jnp.log1p(-mean)
         scale = scale_by_confidence(noise["logit_scale"], data.confidence)
-        return dist.TransformedDistribution(
-            dist.Normal(log_odds, scale), dist.transforms.SigmoidTransform()
-        )
+        share = dist.transforms.SigmoidTransform()
+        return dist.TransformedDistribution(dist.Normal(log_odds, scale), share)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -399,9 +396,8 @@ class StudentTLink(AbstractLink):
         self, name: str, prediction: Prediction, data: Observations, noise: Noise
     ) -> dist.Distribution:
         location = self.center(name, prediction, noise)
-        scale = self.schedule.scale(
-            noise["intensity_scale"], location, cos_degrees(data.geometry.view_zenith)
-        )
+        cos_view = cos_degrees(data.geometry.view_zenith)
+        scale = self.schedule.scale(noise["intensity_scale"], location, cos_view)
         scale = scale_by_confidence(scale, data.confidence)
         return SensorStudentT(
             self.degrees_of_freedom, location, scale, data.saturated, data.full_scale

@@ -66,9 +66,8 @@ class Geometry(NamedTuple):
         Returns:
             Geometry of shape (..., view); a lone angle counts as one view.
         """
-        angles = [
-            jnp.asarray(angle) for angle in (view_zenith, view_azimuth, light_zenith, light_azimuth)
-        ]
+        given = (view_zenith, view_azimuth, light_zenith, light_azimuth)
+        angles = [jnp.asarray(angle) for angle in given]
         dtype = jnp.result_type(float, *angles)
         angles = [jnp.atleast_1d(angle).astype(dtype) for angle in angles]
         view_zenith, view_azimuth, light_zenith, light_azimuth = jnp.broadcast_arrays(*angles)

@@ -19,7 +19,6 @@ from polar_bayes.physics.geometry import (
     per_ray,
     sin_degrees,
 )
-from polar_bayes.physics.microfacet import SlopeEllipse
 from polar_bayes.physics.part import Parameters, Part, check_part, like, squared_rule, unit_rule
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import (
@@ -40,18 +39,13 @@ class AbstractIllumination(Part):
 
     @abc.abstractmethod
     def reflect(
-        self,
-        facets: Microsurface,
-        ellipse: SlopeEllipse,
-        stack: Stack,
-        geometry: Geometry,
-        parameters: Parameters,
+        self, facets: Microsurface, stack: Stack, geometry: Geometry, parameters: Parameters
     ) -> Light:
         """Light that facets mirror to the viewer.
 
         Args:
-            facets: How they tilt, which are seen, and how many stand for all.
-            ellipse: Their slopes in the frame of each viewer. Broadcasts with (..., view).
+            facets: How they tilt in the frame of each viewer, which are seen, and how many stand
+                for all.
             stack: What one facet is made of. Broadcasts with (..., view).
             geometry: Directions. Shape (..., view), degree.
             parameters: Material parameters by name, for those of the light itself.
@@ -117,12 +111,7 @@ class PointSource(AbstractIllumination):
 
     @override
     def reflect(
-        self,
-        facets: Microsurface,
-        ellipse: SlopeEllipse,
-        stack: Stack,
-        geometry: Geometry,
-        parameters: Parameters,
+        self, facets: Microsurface, stack: Stack, geometry: Geometry, parameters: Parameters
     ) -> Light:
         facet = mirror_facet(geometry)
         cos_view, cos_light = cos_degrees(geometry.view_zenith), cos_degrees(geometry.light_zenith)
@@ -130,13 +119,11 @@ class PointSource(AbstractIllumination):
         to_light = sin_degrees(geometry.light_zenith) / cos_light
         azimuth = geometry.light_azimuth - geometry.view_azimuth
         seen = facets.shadowing.both(
-            facets.visible(ellipse, to_viewer, jnp.zeros_like(to_viewer)),
-            facets.visible(
-                ellipse, to_light * cos_degrees(azimuth), to_light * sin_degrees(azimuth)
-            ),
+            facets.visible(to_viewer, jnp.zeros_like(to_viewer)),
+            facets.visible(to_light * cos_degrees(azimuth), to_light * sin_degrees(azimuth)),
         )
         mirrored = mirror_light(stack, facet, geometry, self.incident(parameters, geometry))
-        density = facets.density(ellipse, geometry, facet.tan_squared_tilt)
+        density = facets.density(geometry, facet.tan_squared_tilt)
         return mirrored._replace(intensity=density * seen / (4.0 * cos_view) * mirrored.intensity)
 
     @override
@@ -181,24 +168,17 @@ class AbstractExtendedSource(AbstractIllumination):
 
     @override
     def reflect(
-        self,
-        facets: Microsurface,
-        ellipse: SlopeEllipse,
-        stack: Stack,
-        geometry: Geometry,
-        parameters: Parameters,
+        self, facets: Microsurface, stack: Stack, geometry: Geometry, parameters: Parameters
     ) -> Light:
         sin_view, cos_view = sin_degrees(geometry.view_zenith), cos_degrees(geometry.view_zenith)
-        sample = facets.sample(ellipse, geometry, self.border)
+        sample = facets.sample(geometry, self.border)
         power = per_facet(stack).relative_reflection(sample.cos_incidence, sample.sin_squared)
         cos_light = jnp.clip(sample.cos_light, 1e-6, 1.0)
         to_viewer = sin_view / cos_view
         seen = facets.shadowing.both(
-            facets.visible(ellipse, to_viewer, jnp.zeros_like(to_viewer))[..., None, :],
-            facets.visible(
-                per_facet(ellipse),
-                sample.light_in_plane / cos_light,
-                sample.light_out_of_plane / cos_light,
+            facets.visible(to_viewer, jnp.zeros_like(to_viewer))[..., None, :],
+            facets.per_facet().visible(
+                sample.light_in_plane / cos_light, sample.light_out_of_plane / cos_light
             ),
         )
         lit = sample.weight * seen
@@ -225,17 +205,12 @@ class UniformSky(AbstractExtendedSource):
         # A squared cosine for the nodes, since transmission is steep at grazing. Four azimuths sum
         # up once and twice around to nothing, which is all that scattering knows of azimuth.
         cosine, weight = squared_rule(8)
-        solid_angle = 0.5 * np.pi * weight
         rays = per_ray(geometry)
-        zenith, azimuth = np.degrees(np.arccos(cosine)), 90.0 * np.arange(4.0)
-        around = like(np.tile(azimuth, cosine.size), rays.view_azimuth)
-        return (
-            rays._replace(
-                light_zenith=like(np.repeat(zenith, 4), rays.view_zenith),
-                light_azimuth=rays.view_azimuth + around,
-            ),
-            like(np.repeat(solid_angle, 4), rays.view_zenith),
-        )
+        columns = np.degrees(np.arccos(cosine)), 0.5 * np.pi * weight
+        zenith, solid_angle = (like(np.repeat(x, 4), rays.view_zenith) for x in columns)
+        around = like(np.tile(90.0 * np.arange(4.0), cosine.size), rays.view_azimuth)
+        rays = rays._replace(light_zenith=zenith, light_azimuth=rays.view_azimuth + around)
+        return rays, solid_angle
 
 
 @dataclasses.dataclass(frozen=True)
@@ -292,14 +267,10 @@ class Disc(AbstractExtendedSource):
         azimuth = jnp.rad2deg(jnp.arctan2(across, forwards))
         irradiance = jnp.where(up > 0.0, 0.5 * solid_angle, 0.0)
         # Both sides of the plane of the viewer.
-        both = jnp.concatenate([azimuth, -azimuth], axis=-1)
-        return (
-            rays._replace(
-                light_zenith=jnp.concatenate([zenith, zenith], axis=-1),
-                light_azimuth=rays.view_azimuth + both,
-            ),
-            jnp.concatenate([irradiance, irradiance], axis=-1),
-        )
+        azimuth = jnp.concatenate([azimuth, -azimuth], axis=-1)
+        zenith, irradiance = (jnp.concatenate([x, x], axis=-1) for x in (zenith, irradiance))
+        rays = rays._replace(light_zenith=zenith, light_azimuth=rays.view_azimuth + azimuth)
+        return rays, irradiance
 
     def _directions(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Cosine from the axis, sine times cosine of azimuth, and solid angle of each direction."""

@@ -94,9 +94,8 @@ def value_of(setting: Setting, parameters: Parameters) -> Array:
 
 def parameters_of(*parts: Any) -> tuple[str, ...]:
     """The parameters that several parts read, each once; a part may be None."""
-    return tuple(
-        dict.fromkeys(name for part in parts if part is not None for name in part.parameters)
-    )
+    names = (name for part in parts if part is not None for name in part.parameters)
+    return tuple(dict.fromkeys(names))
 
 
 def check_part(value: object, where: str, kind: type, allowed: str) -> None:

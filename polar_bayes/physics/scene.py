@@ -76,19 +76,15 @@ class Scene(HTMLRepr):
     def __post_init__(self) -> None:
         check_part(self.surface, "surface", AbstractSurface, "SmoothSurface() or RoughSurface()")
         for name, kind, allowed in (
-            (
-                "subsurface",
-                AbstractSubsurface,
-                "Unpolarized(), Lambertian(), Depolarizer() or None",
-            ),
-            ("mixing", AbstractMixing, "DopMixing(), StokesMixing() or None"),
-            ("coat", AbstractCoat, "ClearCoat(), ThinFilm(), CoatStack((...)) or None"),
-            ("instrument", Instrument, "Instrument((DolpGain(), ...)) or None"),
-            ("dispersion", AbstractDispersion, "Cauchy(), Sellmeier() or None"),
-            ("normal", TiltedNormal, "TiltedNormal() or None"),
+            ("subsurface", AbstractSubsurface, "Unpolarized(), Lambertian(), Depolarizer()"),
+            ("mixing", AbstractMixing, "DopMixing(), StokesMixing()"),
+            ("coat", AbstractCoat, "ClearCoat(), ThinFilm(), CoatStack((...))"),
+            ("instrument", Instrument, "Instrument((DolpGain(), ...))"),
+            ("dispersion", AbstractDispersion, "Cauchy(), Sellmeier()"),
+            ("normal", TiltedNormal, "TiltedNormal()"),
         ):
             if getattr(self, name) is not None:
-                check_part(getattr(self, name), name, kind, allowed)
+                check_part(getattr(self, name), name, kind, f"{allowed} or None")
         if self.mixing is not None and self.subsurface is None:
             hint = "give a subsurface, such as Depolarizer(), or leave mixing=None"
             raise SceneError("there is no subsurface to mix", where="mixing", hint=hint)

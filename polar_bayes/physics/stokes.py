@@ -53,10 +53,8 @@ class Light(NamedTuple):
 
 def to_stokes(light: Light) -> Array:
     """Stokes vector (S0, S1, S2) on a new last axis: (..., view) -> (..., view, 3)."""
-    return jnp.stack(
-        jnp.broadcast_arrays(light.intensity, light.intensity * light.q, light.intensity * light.u),
-        axis=-1,
-    )
+    intensity, q, u = light
+    return jnp.stack(jnp.broadcast_arrays(intensity, intensity * q, intensity * u), axis=-1)
 
 
 def degree_of_linear_polarization(q: Array, u: Array) -> Array:
