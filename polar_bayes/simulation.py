@@ -22,6 +22,15 @@ from polar_bayes.errors import CaptureError, FitError, SceneError
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink, noise_parameters
 from polar_bayes.physics.geometry import Geometry
+from polar_bayes.physics.instrument import (
+    AngleZero,
+    BeamOverlap,
+    ChannelGain,
+    DarkLevel,
+    Discrepancy,
+    DolpGain,
+    Leakage,
+)
 from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import RANGES
@@ -142,13 +151,12 @@ class Protocol:
 
 # --- Validation of parameters and noise -----------------------------------------------------------
 
-_ZEROS = ("leakage", "dark_level", "angle_zero", "normal_tilt_x", "normal_tilt_y")
+_TERMS = (AngleZero, BeamOverlap, ChannelGain, DarkLevel, Discrepancy, DolpGain, Leakage)
 
 NEUTRAL: Mapping[str, np.ndarray] = {
-    **dict.fromkeys((*_ZEROS, "discrepancy_amplitude"), np.asarray(0.0)),
-    **dict.fromkeys(("dolp_gain", "channel_gain_ratio"), np.asarray(1.0)),
+    **{name: np.asarray(x) for term in _TERMS for name, x in term.neutral.items()},
+    **dict.fromkeys(("normal_tilt_x", "normal_tilt_y"), np.asarray(0.0)),
     "discrepancy_weights": np.zeros(3),
-    "beam_overlap_zenith": np.asarray(90.0),
 }
 """A perfect instrument and a level sample, by the names of the terms' parameters."""
 

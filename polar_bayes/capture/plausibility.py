@@ -149,18 +149,10 @@ def cautions(capture: xr.Dataset) -> tuple[str, ...]:
     Returns:
         A sentence for each, none for a capture in which nothing is unlikely.
     """
-    parts = _materials(capture)
-    return tuple(
-        dict.fromkeys(
-            itertools.chain(
-                _azimuth_cautions(capture),
-                _excess_cautions(capture),
-                *(_sign_cautions(name, part) for name, part in parts),
-                *(_side_cautions(name, part) for name, part in parts),
-                *(_scale_cautions(name, part) for name, part in parts),
-            )
-        )
-    )
+    found = [*_azimuth_cautions(capture), *_excess_cautions(capture)]
+    for check in (_sign_cautions, _side_cautions, _scale_cautions):
+        found += [each for name, part in _materials(capture) for each in check(name, part)]
+    return tuple(dict.fromkeys(found))
 
 
 def inferred(capture: xr.Dataset) -> tuple[str, ...]:
@@ -173,13 +165,10 @@ def inferred(capture: xr.Dataset) -> tuple[str, ...]:
         Sentences on readings, directions, wavelengths, the sign of q and Brewster's angle by eye,
         as far as the capture has them.
     """
-    return tuple(
-        itertools.chain(
-            [_readings_sentence(capture)],
-            *(_sign_sentences(name, part) for name, part in _materials(capture)),
-            *(_brewster_sentences(name, part) for name, part in _materials(capture)),
-        )
-    )
+    found = [_readings_sentence(capture)]
+    for tell in (_sign_sentences, _brewster_sentences):
+        found += [each for name, part in _materials(capture) for each in tell(name, part)]
+    return tuple(found)
 
 
 def stated(capture: xr.Dataset) -> tuple[str, ...]:

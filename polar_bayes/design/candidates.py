@@ -83,10 +83,8 @@ class Constraints:
 
 def _distance(some: Directions, others: Directions) -> Float[np.ndarray, "some other"]:
     """The larger of the angles between two viewers and between two lights."""
-    return np.maximum(
-        _angle(some[:, None, :2], others[None, :, :2]),
-        _angle(some[:, None, 2:], others[None, :, 2:]),
-    )
+    viewers = _angle(some[:, None, :2], others[None, :, :2])
+    return np.maximum(viewers, _angle(some[:, None, 2:], others[None, :, 2:]))
 
 
 def _angle(some: np.ndarray, others: np.ndarray) -> np.ndarray:

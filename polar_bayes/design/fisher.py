@@ -66,11 +66,8 @@ def information(distribution: dist.Distribution) -> FisherInformation:
         hint = f"use a link that gives one of {', '.join(f.__name__ for f in _FORMULAS)}"
         raise FitError(what, where="identify", hint=hint)
     parameters, matrix = formula(distribution)
-    size = len(parameters)
-    return FisherInformation(
-        tuple(jnp.broadcast_to(x, shape) for x in parameters),
-        jnp.broadcast_to(matrix, (*shape, size, size)),
-    )
+    parameters = tuple(jnp.broadcast_to(x, shape) for x in parameters)
+    return FisherInformation(parameters, jnp.broadcast_to(matrix, (*shape, *matrix.shape[-2:])))
 
 
 def _symmetric(first: Array, across: Array, second: Array) -> Array:
@@ -205,10 +202,8 @@ def reading_information(
 
 def total_information(readings: Mapping[str, ReadingInformation]) -> Float[Array, "size size"]:
     """Fisher information of all readings about the unconstrained coordinates."""
-    parts = [
-        jnp.einsum("...ki,...kl,...lj->ij", each.jacobian, each.information, each.jacobian)
-        for each in readings.values()
-    ]
+    total = functools.partial(jnp.einsum, "...ki,...kl,...lj->ij")
+    parts = [total(each.jacobian, each.information, each.jacobian) for each in readings.values()]
     return jnp.sum(jnp.stack(parts), axis=0)
 
 
@@ -238,10 +233,8 @@ def paper_information(
 
     def weighted_sum(weights: list[Array]) -> Array:
         means = [each.jacobian[..., 0, :] for each in of_beta]
-        parts = [
-            jnp.einsum("...i,...,...j->ij", mean, weight, mean)
-            for mean, weight in zip(means, weights, strict=True)
-        ]
+        pairs = zip(means, weights, strict=True)
+        parts = [jnp.einsum("...i,...,...j->ij", mean, weight, mean) for mean, weight in pairs]
         return jnp.sum(jnp.stack(parts), axis=0)
 
     return (

@@ -214,7 +214,7 @@ def _selected(
     selection = fedorov_exchange(loss, design.base, design.each, options, conflicts, count)
     asked = {"criterion": repr(criterion), "constraints": repr(constraints)}
     provenance = provenance_attrs(request, **asked, exchanges=selection.exchanges)
-    return _assemble(request.capture, views, design, selection, names).assign_attrs(provenance)
+    return _assemble(views, design, selection, names).assign_attrs(provenance)
 
 
 def _extended(
@@ -305,11 +305,7 @@ def _with_predicted_brightness(
 
 
 def _assemble(
-    capture: xr.Dataset,
-    views: CandidateViews,
-    design: Design,
-    selection: Selection,
-    names: list[str],
+    views: CandidateViews, design: Design, selection: Selection, names: list[str]
 ) -> xr.Dataset:
     picks = np.array(selection.picks)
     added = np.cumsum(design.each[:, picks], axis=1)
@@ -329,7 +325,7 @@ def _assemble(
     for column, name in enumerate(ANGLES):
         found[name] = ("pick", views.directions[at, column], {"units": "degree"})
     if (design.wavelength >= 0).any():
-        wavelengths = capture["wavelength"].to_numpy()[design.wavelength[picks]]
+        wavelengths = views.capture["wavelength"].to_numpy()[design.wavelength[picks]]
         found["wavelength"] = ("pick", wavelengths, {"units": "nm"})
     if (design.reading != "").any():
         found["reading"] = ("pick", design.reading[picks])
