@@ -19,13 +19,13 @@ import math
 import os
 import re
 import sys
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from decimal import Decimal
 from numbers import Real
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from polar_bayes.capture.combine import DIMS, PER_VIEW, combine
@@ -204,15 +204,10 @@ def _spectral(values: dict[str, np.ndarray], waves: np.ndarray) -> xr.Dataset:
 
 def _views(values: dict[str, np.ndarray], column: np.ndarray) -> np.ndarray:
     """The view of each line: one for each set of directions, and one more for each repetition."""
-    numbers: dict[tuple, int] = {}
-    repetitions: Counter[tuple] = Counter()
-    views = []
-    directions = [values[name] for name in PER_VIEW if name in values]
-    for line in zip(*directions, column, strict=True):
-        key = (*line[:-1], repetitions[line])
-        repetitions[line] += 1
-        views.append(numbers.setdefault(key, len(numbers)))
-    return np.array(views)
+    directions = {name: values[name] for name in PER_VIEW if name in values}
+    lines = pd.DataFrame({**directions, "column": column})
+    lines["repetition"] = lines.groupby([*lines], sort=False).cumcount()
+    return lines.groupby([*directions, "repetition"], sort=False).ngroup().to_numpy()
 
 
 # --- Text tables of numbers, as detectors and spreadsheets write them -----------------------------
