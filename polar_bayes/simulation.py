@@ -275,6 +275,9 @@ IMAGE = ("y", "x")
 STATED_ERROR = 0.01
 """Standard error that the instrument states of every reading, for the links that read it."""
 
+BRIGHT_QUANTILE, BRIGHT_LEVEL = 0.9, 0.6
+"""Exposure puts the 90% brightest view at 60% of full scale; a specular lobe may saturate."""
+
 
 def simulate(
     preset: str | Material = "leaf",
@@ -385,10 +388,10 @@ def _record(
     prediction = scene.predict(parameters, layout.geometry)
     prediction = {n: jnp.broadcast_to(x, layout.shape) for n, x in prediction.items()}
     light = prediction["intensity"]
-    # Exposure puts the 90% brightest view at 60% of full scale; a specular lobe may saturate.
     # Outside its highlight a bare mirror is black: no camera exposes for what is left of a lobe
     # there, so that the brightest view sets the exposure if its contrast is larger than 1e4.
-    exposure = 0.6 / jnp.maximum(jnp.quantile(light, 0.9), jnp.max(light) / 1e4)
+    bright = jnp.maximum(jnp.quantile(light, BRIGHT_QUANTILE), jnp.max(light) / 1e4)
+    exposure = BRIGHT_LEVEL / bright
     levels = {
         name: exposure if level is None else _align_image(level, axes)
         for name, level in noise.items()

@@ -5,7 +5,7 @@ At every value of the coordinate $z_i$ of a parameter all others are optimized,
 $$ \max_{z_{-i}} [\log L(z) + w \log \pi(z)] $$
 
 by numerical continuation: BFGS starts where the value before ended, in one compiled potential for
-all grids. $w = 1$ gives the profile of the posterior, $w$ = `PRIOR_WEIGHT` that of the likelihood:
+all grids. $w = 1$ gives the profile of the posterior, $w = 0.001$ that of the likelihood:
 a thousandth of the prior keeps coordinates that the data do not determine from diverging. The
 priors of the instrument's parameters belong to $L$ in both: a calibration determines them, and
 without it they trade for one another.
