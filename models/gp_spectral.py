@@ -7,7 +7,6 @@ posterior too (`polar_bayes.inference.predict_spectrum`).
 """
 
 import dataclasses
-from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpyro
@@ -16,6 +15,8 @@ from numpyro import distributions as dist
 
 from polar_bayes.models.hierarchical import check_members, check_pooled, draw_pooled
 from polar_bayes.models.sites import (
+    Links,
+    Priors,
     constant_axes,
     declare_readings,
     draw,
@@ -34,7 +35,6 @@ from polar_bayes.models.spectral_process import (
     weight_scale,
 )
 from polar_bayes.observation.data import Observations
-from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import support_bounds
 from polar_bayes.repr_html import HTMLRepr
@@ -73,13 +73,7 @@ class GpSpectral(HTMLRepr):
             return self.process[self.coupled.index(name)]
         return self.process
 
-    def __call__(
-        self,
-        data: Observations,
-        scene: Scene,
-        priors: Mapping[str, dist.Distribution],
-        links: Mapping[str, AbstractLink],
-    ) -> None:
+    def __call__(self, data: Observations, scene: Scene, priors: Priors, links: Links) -> None:
         """Declare the generative model of a capture with a wavelength axis."""
         check_capture(self.coupled, data, scene)
         check_members(self.pooled, data, scene)
@@ -95,7 +89,7 @@ class GpSpectral(HTMLRepr):
         declare_readings(parameters, data, scene, priors, links)
 
     def _spectrum(
-        self, name: str, data: Observations, priors: Mapping[str, dist.Distribution]
+        self, name: str, data: Observations, priors: Priors
     ) -> Float[Array, "... wavelength"]:
         """Sample one spectrum, for each patch its own."""
         process, wavelength = self.process_of(name), wavelengths_of(data)

@@ -11,7 +11,7 @@ scale.
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -22,6 +22,8 @@ from numpyro import distributions as dist
 
 from polar_bayes.errors import FitError
 from polar_bayes.models.sites import (
+    Links,
+    Priors,
     SoftClip,
     constant_axes,
     declare_readings,
@@ -31,7 +33,6 @@ from polar_bayes.models.sites import (
     over_axes,
 )
 from polar_bayes.observation.data import Observations
-from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 from polar_bayes.priors import RANGES, support_bounds
 from polar_bayes.repr_html import HTMLRepr
@@ -70,11 +71,7 @@ def natural_scale(name: str, location: dist.Distribution) -> Scale:
 
 
 def draw_pooled(
-    name: str,
-    data: Observations,
-    priors: Mapping[str, dist.Distribution],
-    *,
-    without: tuple[str, ...],
+    name: str, data: Observations, priors: Priors, *, without: tuple[str, ...]
 ) -> Float[Array, "..."]:
     r"""Sample one parameter of every patch from a common population.
 
@@ -100,18 +97,13 @@ def draw_pooled(
 def check_pooled(pooled: object, *, where: str) -> None:
     """Refuse a choice of pooled parameters that is no tuple of parameters of a material."""
     if not isinstance(pooled, tuple) or not all(isinstance(name, str) for name in pooled):
-        raise FitError(
-            f"pooled={pooled!r} is no tuple of names",
-            where=where,
-            hint="write pooled=('refractive_index',), with the comma",
-        )
+        hint = "write pooled=('refractive_index',), with the comma"
+        raise FitError(f"pooled={pooled!r} is no tuple of names", where=where, hint=hint)
     for name in pooled:
         if name not in MATERIAL_PARAMETERS:
-            raise FitError(
-                f"{name!r} is no parameter of a material",
-                where=f"{where}: pooled",
-                hint=f"name any of {', '.join(MATERIAL_PARAMETERS)}",
-            )
+            what = f"{name!r} is no parameter of a material"
+            hint = f"name any of {', '.join(MATERIAL_PARAMETERS)}"
+            raise FitError(what, where=f"{where}: pooled", hint=hint)
 
 
 def check_members(pooled: tuple[str, ...], data: Observations, scene: Scene) -> None:
@@ -119,17 +111,12 @@ def check_members(pooled: tuple[str, ...], data: Observations, scene: Scene) -> 
     possible = [name for name in MATERIAL_PARAMETERS if name in scene.parameters]
     missing = [name for name in pooled if name not in possible]
     if missing:
-        raise FitError(
-            f"the scene does not read {', '.join(missing)}",
-            where="pooled",
-            hint=f"pool any of {', '.join(possible)}",
-        )
+        hint = f"pool any of {', '.join(possible)}"
+        raise FitError(f"the scene does not read {', '.join(missing)}", where="pooled", hint=hint)
     if pooled and not any(axis not in ("wavelength", "view") for axis, _ in data.dims):
-        raise FitError(
-            "a population needs several members, and the capture has no axis patch or material",
-            where="model",
-            hint="give captures joined by polar_bayes.capture.combine, or use model='per_material'",
-        )
+        what = "a population needs several members, and the capture has no axis patch or material"
+        hint = "give captures joined by polar_bayes.capture.combine, or use model='per_material'"
+        raise FitError(what, where="model", hint=hint)
 
 
 # --- The model ------------------------------------------------------------------------------------
@@ -151,19 +138,10 @@ class Hierarchical(HTMLRepr):
     def __post_init__(self) -> None:
         check_pooled(self.pooled, where="Hierarchical")
         if not self.pooled:
-            raise FitError(
-                "nothing is pooled",
-                where="Hierarchical",
-                hint="name a parameter, or use model='per_material'",
-            )
+            hint = "name a parameter, or use model='per_material'"
+            raise FitError("nothing is pooled", where="Hierarchical", hint=hint)
 
-    def __call__(
-        self,
-        data: Observations,
-        scene: Scene,
-        priors: Mapping[str, dist.Distribution],
-        links: Mapping[str, AbstractLink],
-    ) -> None:
+    def __call__(self, data: Observations, scene: Scene, priors: Priors, links: Links) -> None:
         """Declare the generative model of a capture with a leading axis (patch or material)."""
         check_members(self.pooled, data, scene)
         parameters = {}

@@ -5,22 +5,18 @@ change with color, so a capture with a wavelength axis has one of each per wavel
 turns them into what the instrument would record (eq. 1), the links say how readings scatter.
 """
 
-from collections.abc import Mapping
-
-from numpyro import distributions as dist
-
-from polar_bayes.models.sites import declare_readings, draw_independent, material_parameters
+from polar_bayes.models.sites import (
+    Links,
+    Priors,
+    declare_readings,
+    draw_independent,
+    material_parameters,
+)
 from polar_bayes.observation.data import Observations
-from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 
 
-def per_material(
-    data: Observations,
-    scene: Scene,
-    priors: Mapping[str, dist.Distribution],
-    links: Mapping[str, AbstractLink],
-) -> None:
+def per_material(data: Observations, scene: Scene, priors: Priors, links: Links) -> None:
     """Declare the generative model of one capture."""
     parameters = {name: draw_independent(name, data, priors) for name in material_parameters(scene)}
 

@@ -3,7 +3,7 @@
 import contextlib
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any, override
+from typing import override
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,9 @@ from numpyro.distributions.transforms import Transform
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink, noise_parameters
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
+
+Priors = Mapping[str, dist.Distribution]
+Links = Mapping[str, AbstractLink]
 
 SPECTRAL = ("absorption", "refractive_index")
 """Parameters with one value per wavelength."""
@@ -36,9 +39,7 @@ def material_parameters(scene: Scene) -> tuple[str, ...]:
     return tuple(name for name in MATERIAL_PARAMETERS if name in scene.parameters)
 
 
-def draw_independent(
-    name: str, data: Observations, priors: Mapping[str, dist.Distribution]
-) -> Float[Array, "..."]:
+def draw_independent(name: str, data: Observations, priors: Priors) -> Float[Array, "..."]:
     """Sample a parameter of the material independently for each patch, or wavelength."""
     with over_axes(data, without=constant_axes(name)):
         return draw(name, priors[name], data)
@@ -117,7 +118,7 @@ class SoftClip(Transform):
         return x - self.scale * jnp.log(-jnp.expm1(-below))
 
     @override
-    def log_abs_det_jacobian(self, x: Array, y: Array, intermediates: Any = None) -> Array:
+    def log_abs_det_jacobian(self, x: Array, y: Array, intermediates: object = None) -> Array:
         slope = jax.nn.log_sigmoid((x - self.low) / self.scale)
         if math.isinf(self.high):
             return slope
@@ -139,19 +140,12 @@ class SoftClip(Transform):
 
 
 def declare_readings(
-    parameters: Mapping[str, Array],
-    data: Observations,
-    scene: Scene,
-    priors: Mapping[str, dist.Distribution],
-    links: Mapping[str, AbstractLink],
+    parameters: Mapping[str, Array], data: Observations, scene: Scene, priors: Priors, links: Links
 ) -> None:
     """Declare instrument, noise, and the likelihood of the readings around eq. 1."""
     # The instrument and the noise: one value for the whole capture, shared by all its patches.
-    instrument = {
-        name: numpyro.sample(name, priors[name])
-        for name in scene.parameters
-        if name not in parameters
-    }
+    rest = [name for name in scene.parameters if name not in parameters]
+    instrument = {name: numpyro.sample(name, priors[name]) for name in rest}
     noise = {name: numpyro.sample(name, priors[name]) for name in noise_parameters(links)}
 
     parameters = {**parameters, **instrument}

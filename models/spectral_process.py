@@ -16,6 +16,9 @@ from polar_bayes.observation.data import Observations
 from polar_bayes.physics.scene import Scene
 from polar_bayes.repr_html import HTMLRepr
 
+Knots = Float[Array, " knots"]
+Wavelengths = Float[Array, " wavelength"]
+
 KERNELS = ("Exp", "ExpSquared", "Matern32", "Matern52")
 """The decaying kernels of tinygp whose only parameter is a length."""
 
@@ -67,47 +70,39 @@ class SpectralProcess(HTMLRepr):
 
     def __post_init__(self) -> None:
         if isinstance(self.kernel, str) and self.kernel not in KERNELS:
-            raise FitError(
-                f"there is no stationary kernel {self.kernel!r}",
-                where="SpectralProcess: kernel",
-                hint=f"give one of {', '.join(KERNELS)}, a tinygp kernel, or a function of length",
-            )
+            what = f"there is no stationary kernel {self.kernel!r}"
+            hint = f"give one of {', '.join(KERNELS)}, a tinygp kernel, or a function of length"
+            raise FitError(what, where="SpectralProcess: kernel", hint=hint)
         if not isinstance(self.kernel, str) and not callable(self.kernel):
-            raise FitError(
-                f"a {type(self.kernel).__name__} is no kernel",
-                where="SpectralProcess: kernel",
-                hint=f"give one of {', '.join(KERNELS)}, a tinygp kernel, or a function of length",
-            )
+            what = f"a {type(self.kernel).__name__} is no kernel"
+            hint = f"give one of {', '.join(KERNELS)}, a tinygp kernel, or a function of length"
+            raise FitError(what, where="SpectralProcess: kernel", hint=hint)
         if not isinstance(self.knots, int) or isinstance(self.knots, bool) or self.knots < 2:
-            raise FitError(
-                f"knots={self.knots!r} cannot span wavelengths",
-                where="SpectralProcess",
-                hint="give a whole number from 2 on; 20 is the default",
-            )
+            what = f"knots={self.knots!r} cannot span wavelengths"
+            hint = "give a whole number from 2 on; 20 is the default"
+            raise FitError(what, where="SpectralProcess", hint=hint)
 
     @property
     def fits_length(self) -> bool:
         """False where the kernel is an object, which has a length of its own."""
         return not isinstance(self.kernel, kernels.Kernel)
 
-    def knot_wavelengths(self, wavelength: Float[Array, " wavelength"]) -> Float[Array, " knots"]:
+    def knot_wavelengths(self, wavelength: Wavelengths) -> Knots:
         """The knots of these measured wavelengths in ascending order, nm."""
         if wavelength.size <= self.knots:
             return jnp.sort(wavelength)
         return jnp.linspace(jnp.min(wavelength), jnp.max(wavelength), self.knots)
 
-    def scales(
-        self, length: Float[Array, ""] | None, knot_wavelengths: Float[Array, " knots"]
-    ) -> Float[Array, " knots"]:
+    def scales(self, length: Array | None, knot_wavelengths: Knots) -> Knots:
         """How much each weight moves the values at the knots, given those before it. 1, > 0."""
         return jnp.diag(self._factor(length, knot_wavelengths))
 
     def values(
         self,
         weights: Float[Array, "... knots"],
-        length: Float[Array, ""] | None,
-        knot_wavelengths: Float[Array, " knots"],
-        wavelength: Float[Array, " wavelength"],
+        length: Array | None,
+        knot_wavelengths: Knots,
+        wavelength: Wavelengths,
     ) -> Float[Array, "... wavelength"]:
         """The process at any wavelengths, as far as its knots determine it.
 
@@ -123,10 +118,7 @@ class SpectralProcess(HTMLRepr):
         return weights @ self._across(length, knot_wavelengths, wavelength)
 
     def remainder(
-        self,
-        length: Float[Array, ""] | None,
-        knot_wavelengths: Float[Array, " knots"],
-        wavelength: Float[Array, " wavelength"],
+        self, length: Array | None, knot_wavelengths: Knots, wavelength: Wavelengths
     ) -> Float[Array, "wavelength wavelength"]:
         """Lower Cholesky factor of the covariance that the knots leave undetermined.
 
@@ -147,9 +139,8 @@ class SpectralProcess(HTMLRepr):
 
     def _across(self, length: Array | None, knot_wavelengths: Array, wavelength: Array) -> Array:
         """What each weight does to the values at these wavelengths: (knots, wavelength)."""
-        turned = _polynomials(knot_wavelengths).T @ self._matrix(
-            length, knot_wavelengths, wavelength
-        )
+        across = self._matrix(length, knot_wavelengths, wavelength)
+        turned = _polynomials(knot_wavelengths).T @ across
         return solve_triangular(self._factor(length, knot_wavelengths), turned, lower=True)
 
     def _factor(self, length: Array | None, knot_wavelengths: Array) -> Array:
@@ -208,7 +199,7 @@ def spectrum_around(
     return SoftClip(*bounds)(level + amplitude * departure)
 
 
-def weight_scale(name: str, scales: Float[Array, " knots"]) -> Float[Array, " knots"]:
+def weight_scale(name: str, scales: Knots) -> Knots:
     r"""By how much weights are widened before they are sampled.
 
     $$ \sqrt{1 + (s_j/\sigma)^2}, \quad \text{and 1 for the last} $$
@@ -226,7 +217,7 @@ def weight_scale(name: str, scales: Float[Array, " knots"]) -> Float[Array, " kn
     return jnp.sqrt(1.0 + (scales / TYPICAL_ERROR[name]) ** 2).at[-1].set(1.0)
 
 
-def wavelengths_of(data: Observations) -> Float[Array, " wavelength"]:
+def wavelengths_of(data: Observations) -> Wavelengths:
     """The wavelengths of a capture, nm."""
     wavelength = data.geometry.wavelength
     assert wavelength is not None  # `check_capture` has seen the axis
@@ -235,41 +226,29 @@ def wavelengths_of(data: Observations) -> Float[Array, " wavelength"]:
 
 def check_spectra(coupled: object) -> None:
     """Refuse what is no choice of spectra."""
-    if (
-        not isinstance(coupled, tuple)
-        or not coupled
-        or len(set(coupled)) != len(coupled)
-        or not set(coupled) <= set(SPECTRA)
+    if not (
+        isinstance(coupled, tuple) and 0 < len(coupled) == len(set(coupled).intersection(SPECTRA))
     ):
-        raise FitError(
-            f"coupled={coupled!r} names no spectra",
-            where="GpSpectral",
-            hint=f"give a tuple of one or both of {', '.join(SPECTRA)}",
-        )
+        hint = f"give a tuple of one or both of {', '.join(SPECTRA)}"
+        raise FitError(f"coupled={coupled!r} names no spectra", where="GpSpectral", hint=hint)
 
 
 def check_processes(coupled: tuple[str, ...], process: object) -> None:
     """Refuse processes that do not pair with their spectra."""
     given = process if isinstance(process, tuple) else (process,) * len(coupled)
     if len(given) != len(coupled) or not all(isinstance(p, SpectralProcess) for p in given):
-        raise FitError(
-            f"process={process!r} does not say what {' and '.join(coupled)} follow",
-            where="GpSpectral",
-            hint="give one SpectralProcess(), or a tuple with one for each",
-        )
+        what = f"process={process!r} does not say what {' and '.join(coupled)} follow"
+        hint = "give one SpectralProcess(), or a tuple with one for each"
+        raise FitError(what, where="GpSpectral", hint=hint)
 
 
 def check_capture(coupled: tuple[str, ...], data: Observations, scene: Scene) -> None:
     """Refuse a capture without colors, and a scene without spectra."""
     if "wavelength" not in dict(data.dims):
-        raise FitError(
-            "the capture has no axis wavelength to couple",
-            where="gp_spectral",
-            hint="fit it with model='per_material', or give it the axis and a coordinate in nm",
-        )
+        what = "the capture has no axis wavelength to couple"
+        hint = "fit it with model='per_material', or give it the axis and a coordinate in nm"
+        raise FitError(what, where="gp_spectral", hint=hint)
     if scene.dispersion is None and not set(coupled) & set(scene.parameters):
-        raise FitError(
-            f"the scene reads no {' and no '.join(coupled)}",
-            where="gp_spectral",
-            hint=f"couple one of {', '.join(n for n in SPECTRA if n in scene.parameters)}",
-        )
+        what = f"the scene reads no {' and no '.join(coupled)}"
+        hint = f"couple one of {', '.join(n for n in SPECTRA if n in scene.parameters)}"
+        raise FitError(what, where="gp_spectral", hint=hint)

@@ -14,12 +14,8 @@ from typing import Any, NoReturn
 
 from polar_bayes.errors import FitError, PolarBayesError, one_line
 
-Known = Mapping[str, Callable[..., Any]]
+Known = Mapping[str, Callable[..., object]]
 """What a text may name: classes and functions by their names."""
-
-METHODS = ("expand", "to_event")
-"""Methods of a value that a text may call, as in `Normal(0, 1).expand([4]).to_event(1)`."""
-
 
 MANY = 40
 """As many names are too many for a message."""
@@ -51,7 +47,7 @@ class _Parser:
     where: str
     error: type[PolarBayesError]
 
-    def parse(self, text: object) -> Any:
+    def parse(self, text: object) -> object:
         if not isinstance(text, str):
             self._refuse(f"{text!r} is no text", "quote it")
         try:
@@ -62,7 +58,7 @@ class _Parser:
             self._refuse(f"{one_line(text)!r} is no call")
         return self._value(node)
 
-    def _value(self, node: ast.AST) -> Any:
+    def _value(self, node: ast.AST) -> object:
         if isinstance(node, ast.Tuple | ast.List):
             return tuple(self._value(each) for each in node.elts)
         if isinstance(node, ast.Call):
@@ -75,10 +71,10 @@ class _Parser:
                 self._refuse(f"{name} is not called", f"write {name}()")
             self._refuse(f"{ast.unparse(node)} is neither a number, a text nor a call")
 
-    def _call(self, node: ast.Call) -> Any:
+    def _call(self, node: ast.Call) -> object:
         name = _last_name(node.func)
         on_value = isinstance(node.func, ast.Attribute) and isinstance(node.func.value, ast.Call)
-        if on_value and name in METHODS:
+        if on_value and name in ("expand", "to_event"):  # as in `Normal(0, 1).expand([4])`
             made = getattr(self._value(node.func.value), name, None)  # type: ignore[attr-defined]
         else:
             made = None if on_value else self.known.get(name)

@@ -5,20 +5,17 @@ import os
 import random
 import sys
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import lazy_loader
 
-LOG_LEVEL = "TF_CPP_MIN_LOG_LEVEL"
-
-Attached = tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]
+Attached = tuple[Callable[[str], object], Callable[[], list[str]], list[str]]
 
 
 def attach(package: str, file: str) -> Attached:
     """`__getattr__`, `__dir__` and `__all__` of a package from its `__init__.pyi` (PEP 562)."""
     load, listed, names = lazy_loader.attach_stub(package, file)
 
-    def load_guarded(name: str) -> Any:
+    def load_guarded(name: str) -> object:
         force_numpyro_import()
         with _callers_random_state(), _quiet_compiler():
             return load(name)
@@ -39,14 +36,15 @@ def force_numpyro_import() -> None:
 def _quiet_compiler() -> Iterator[None]:
     """Hide what XLA logs, such as alarms of slow compilation, where it is loaded now."""
     # It reads the variable when it is loaded, so that others find their environment unchanged.
-    if LOG_LEVEL in os.environ or "jaxlib" in sys.modules:
+    log_level = "TF_CPP_MIN_LOG_LEVEL"
+    if log_level in os.environ or "jaxlib" in sys.modules:
         yield
         return
-    os.environ[LOG_LEVEL] = "3"
+    os.environ[log_level] = "3"
     try:
         yield
     finally:
-        os.environ.pop(LOG_LEVEL, None)
+        os.environ.pop(log_level, None)
 
 
 @contextlib.contextmanager

@@ -104,11 +104,9 @@ def is_same_file(one: Path, other: Path) -> bool:
 def output_error(error: Exception, path: Path) -> OutputError:
     """The error of the operating system or a library about an output, as one line."""
     reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return OutputError(
-        f"it could not be written ({reason.lower()})",
-        where=str(path),
-        hint="check the path, its rights and the room on the disk",
-    )
+    what = f"it could not be written ({reason.lower()})"
+    hint = "check the path, its rights and the room on the disk"
+    return OutputError(what, where=str(path), hint=hint)
 
 
 @contextlib.contextmanager

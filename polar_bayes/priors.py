@@ -21,7 +21,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, NoReturn, override
+from typing import NoReturn, override
 
 import jax
 import jax.numpy as jnp
@@ -178,11 +178,7 @@ class Beta(dist.Beta):
     # priors would start JAX on import and stay in single precision. Here they are Python numbers.
 
     def __init__(
-        self,
-        concentration1: float,
-        concentration0: float,
-        *,
-        validate_args: bool | None = None,
+        self, concentration1: float, concentration0: float, *, validate_args: bool | None = None
     ) -> None:
         self.concentration1, self.concentration0 = concentration1, concentration0
         dist.Distribution.__init__(self, validate_args=validate_args)
@@ -328,6 +324,14 @@ def short_numbers(text: str) -> str:
     return re.sub(r"\d+\.\d+(?:e[+-]?\d+)?", lambda found: f"{float(found[0]):g}", text)
 
 
+def unwrapped(distribution: dist.Distribution) -> dist.Distribution:
+    """The distribution inside of masks, copies and events."""
+    wrappers = dist.distribution.MaskedDistribution | dist.ExpandedDistribution | dist.Independent
+    while isinstance(distribution, wrappers):
+        distribution = distribution.base_dist
+    return distribution
+
+
 def _safely_described(prior: dist.Distribution, style: "_Readable") -> str:
     try:
         return style.describe(prior)
@@ -336,14 +340,16 @@ def _safely_described(prior: dist.Distribution, style: "_Readable") -> str:
         return type(prior).__name__
 
 
+type Mixture = dist.MixtureSameFamily | dist.MixtureGeneral
+
+
 class _Readable:
     """Descriptions for readers."""
 
     def describe(self, prior: dist.Distribution) -> str:
         """A distribution with its arguments."""
         shape = (*prior.batch_shape, *prior.event_shape)
-        while isinstance(prior, _WRAPPERS):
-            prior = prior.base_dist
+        prior = unwrapped(prior)
         copies = f" x {shape}" if shape != (*prior.batch_shape, *prior.event_shape) else ""
         return f"{self._call(prior)}{copies}"
 
@@ -359,7 +365,12 @@ class _Readable:
         return f"<array {numbers.shape}>"
 
     def _call(self, prior: dist.Distribution) -> str:
-        if isinstance(prior, _TRUNCATED):
+        if isinstance(
+            prior,
+            dist.LeftTruncatedDistribution
+            | dist.RightTruncatedDistribution
+            | dist.TwoSidedTruncatedDistribution,
+        ):
             return self.truncated(prior)
         if isinstance(prior, dist.MixtureSameFamily | dist.MixtureGeneral):
             return self.mixture(prior)
@@ -381,7 +392,7 @@ class _Readable:
         bounds = zip(("low", "high"), support_bounds(prior), strict=True)
         return ", ".join(f"{key}={self.number(x)}" for key, x in bounds if math.isfinite(x))
 
-    def mixture(self, prior: Any) -> str:
+    def mixture(self, prior: Mixture) -> str:
         weights = self.text(np.asarray(prior.mixing_distribution.probs))
         return f"Mixture(weights={weights}, {', '.join(map(self.describe, _components(prior)))})"
 
@@ -390,11 +401,8 @@ class _Readable:
 
     def fields(self, values: Mapping[str, object]) -> str:
         """The numeric values among these, as `loc=1, scale=2`."""
-        numbers = {
-            key: np.asarray(value)
-            for key, value in values.items()
-            if not key.startswith("_") and np.asarray(value).dtype.kind in "iuf"
-        }
+        shown = {key: np.asarray(x) for key, x in values.items() if not key.startswith("_")}
+        numbers = {key: x for key, x in shown.items() if x.dtype.kind in "iuf"}
         return ", ".join(f"{key}={self.text(number)}" for key, number in numbers.items())
 
 
@@ -427,7 +435,7 @@ class _Exact(_Readable):
         return f"TruncatedDistribution({self.describe(prior.base_dist)}, {self.bounds(prior)})"
 
     @override
-    def mixture(self, prior: Any) -> str:
+    def mixture(self, prior: Mixture) -> str:
         weights = f"CategoricalProbs({self.fields({'probs': prior.mixing_distribution.probs})})"
         inner = ", ".join(map(self.describe, _components(prior)))
         several = isinstance(prior, dist.MixtureGeneral)
@@ -438,22 +446,14 @@ class _Exact(_Readable):
         return f"[{', '.join(steps)}]"
 
 
-_WRAPPERS = (dist.Independent, dist.ExpandedDistribution, dist.distribution.MaskedDistribution)
-_TRUNCATED = (
-    dist.LeftTruncatedDistribution,
-    dist.RightTruncatedDistribution,
-    dist.TwoSidedTruncatedDistribution,
-)
-
-
-def _components(prior: Any) -> Sequence[dist.Distribution]:
+def _components(prior: Mixture) -> Sequence[dist.Distribution]:
     """Components of a mixture."""
     is_general = isinstance(prior, dist.MixtureGeneral)
     return prior.component_distributions if is_general else [prior.component_distribution]
 
 
 @functools.cache
-def _distributions() -> Mapping[str, Callable[..., Any]]:
+def _distributions() -> Mapping[str, Callable[..., object]]:
     """What the text of a prior may name: the distributions and transforms of NumPyro."""
     names = (name for name in dist.__all__ if name[:1].isupper())
     own = {"HalfNormal": HalfNormal, "Beta": Beta}
@@ -462,7 +462,7 @@ def _distributions() -> Mapping[str, Callable[..., Any]]:
     return {name: _with_arrays(made) for name, made in known.items()}
 
 
-def _with_arrays(made: Callable[..., Any]) -> Callable[..., Any]:
+def _with_arrays(made: Callable[..., object]) -> Callable[..., object]:
     """The same for arguments that are tuples of numbers, which NumPyro takes as arrays."""
 
     def convert(argument: object) -> object:
@@ -473,7 +473,7 @@ def _with_arrays(made: Callable[..., Any]) -> Callable[..., Any]:
         return list(argument) if of_parts else np.asarray(argument, float)
 
     @functools.wraps(made)
-    def make(*arguments: object, **keywords: object) -> Any:
+    def make(*arguments: object, **keywords: object) -> object:
         return made(*map(convert, arguments), **{k: convert(x) for k, x in keywords.items()})
 
     return make
@@ -574,11 +574,7 @@ PRIORS = Priors(_ROWS)
 """Default prior of each parameter, by its name."""
 
 ANGLE_ZERO: Mapping[str, dist.Distribution] = MappingProxyType(
-    {
-        "stage": dist.Normal(0.0, 0.2),
-        "hand": PRIORS["angle_zero"],
-        "lens": dist.Normal(0.0, 3.0),
-    }
+    {"stage": dist.Normal(0.0, 0.2), "hand": PRIORS["angle_zero"], "lens": dist.Normal(0.0, 3.0)}
 )
 """Prior of `angle_zero`, degree, by how the angles were set: by a rotary stage, by hand, or read
 from a picture through the geometry of its lens. What is not stated counts as by hand."""
@@ -616,11 +612,9 @@ class PriorTable(Mapping[str, dist.Distribution]):
 
     def __init__(self, overrides: Mapping[str, dist.Distribution] | None = None) -> None:
         if not isinstance(overrides, Mapping | None):
-            raise FitError(
-                f"a {type(overrides).__name__} does not name what it replaces",
-                where="priors",
-                hint="give a mapping such as {'roughness': HalfNormal(0.1)}",
-            )
+            what = f"a {type(overrides).__name__} does not name what it replaces"
+            hint = "give a mapping such as {'roughness': HalfNormal(0.1)}"
+            raise FitError(what, where="priors", hint=hint)
         self._rows = {**PRIORS, **(overrides or {})}
         self._read: dict[str, None] = {}
 
@@ -636,11 +630,8 @@ class PriorTable(Mapping[str, dist.Distribution]):
     def row(self, name: str) -> dist.Distribution:
         """The prior as it was given."""
         if name not in self._rows:
-            raise FitError(
-                "this parameter has no prior",
-                where=f"priors[{name!r}]",
-                hint=f"give one: priors={{{name!r}: <a NumPyro distribution>}}",
-            )
+            hint = f"give one: priors={{{name!r}: <a NumPyro distribution>}}"
+            raise FitError("this parameter has no prior", where=f"priors[{name!r}]", hint=hint)
         self._read[name] = None
         if not isinstance(self._rows[name], dist.Distribution):
             _refuse_prior(self._rows[name], f"priors[{name!r}]")
@@ -687,11 +678,8 @@ def check_support(name: str, prior: dist.Distribution, where: str) -> None:
     except jax.errors.ConcretizationTypeError:
         return  # bounds that depend on other parameters are known only when it runs
     if low < least or high > most:
-        raise FitError(
-            f"{type(prior).__name__} allows values outside {least:g} to {most:g}",
-            where=where,
-            hint=_in_range(least, most),
-        )
+        what = f"{type(prior).__name__} allows values outside {least:g} to {most:g}"
+        raise FitError(what, where=where, hint=_in_range(least, most))
 
 
 def _in_range(least: float, most: float) -> str:
@@ -710,11 +698,8 @@ def _check_override(name: str, prior: object, parameters: tuple[str, ...]) -> No
         near = [known for known in parameters if notation(known).symbol == name]
         near = near or difflib.get_close_matches(name, parameters, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
-        raise FitError(
-            "no such parameter in this model",
-            where=where,
-            hint=f"{hint}the parameters are {', '.join(parameters)}",
-        )
+        hint = f"{hint}the parameters are {', '.join(parameters)}"
+        raise FitError("no such parameter in this model", where=where, hint=hint)
     if not isinstance(prior, dist.Distribution):
         _refuse_prior(prior, where)
     _check_shape(name, prior, where)
@@ -737,24 +722,17 @@ def _refuse_prior(prior: object, where: str) -> NoReturn:
 def _check_shape(name: str, prior: dist.Distribution, where: str) -> None:
     """Refuse what would be repeated over the wrong axes, or cannot be differentiated."""
     if prior.support.is_discrete:
-        raise FitError(
-            f"{type(prior).__name__} is discrete, and samplers follow gradients",
-            where=where,
-            hint="give a continuous distribution",
-        )
+        what = f"{type(prior).__name__} is discrete, and samplers follow gradients"
+        raise FitError(what, where=where, hint="give a continuous distribution")
     usual = PRIORS.get(name)
     if usual is None:
         return  # a parameter of the user's own has the shape that its reader expects
     if len(prior.event_shape) != len(usual.event_shape):
         to_event = "one number" if not usual.event_shape else "a vector: use .expand([n])"
-        raise FitError(
-            f"one draw of it has shape {tuple(prior.event_shape)}",
-            where=where,
-            hint=f"give a distribution of {to_event}{'.to_event(1)' if usual.event_shape else ''}",
-        )
+        what = f"one draw of it has shape {tuple(prior.event_shape)}"
+        hint = f"give a distribution of {to_event}{'.to_event(1)' if usual.event_shape else ''}"
+        raise FitError(what, where=where, hint=hint)
     if prior.batch_shape and prior.batch_shape[-1] != 1:
-        raise FitError(
-            f"it is a batch of {prior.batch_shape[-1]} distributions",
-            where=where,
-            hint="give one, or one per wavelength in shape (wavelength, 1): views share it",
-        )
+        what = f"it is a batch of {prior.batch_shape[-1]} distributions"
+        hint = "give one, or one per wavelength in shape (wavelength, 1): views share it"
+        raise FitError(what, where=where, hint=hint)

@@ -82,7 +82,7 @@ def with_counter[**P, R](what: str) -> Callable[[Callable[P, R]], Callable[P, R]
 
 
 def _with_default[**P, R](
-    run: Callable[P, R], bars: Callable[[], AbstractContextManager[Any]]
+    run: Callable[P, R], bars: Callable[[], AbstractContextManager[object]]
 ) -> Callable[P, R]:
     @functools.wraps(run)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:

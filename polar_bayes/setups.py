@@ -29,12 +29,6 @@ from polar_bayes.priors import (
 )
 from polar_bayes.repr_html import HTMLRepr
 
-__all__ = [
-    "SETUPS",
-    "Setup",
-    "prior_table",
-]
-
 
 @dataclasses.dataclass(frozen=True)
 class Setup(HTMLRepr):
@@ -95,11 +89,8 @@ def find_setup(name: str | Setup) -> Setup:
     if isinstance(name, Setup):
         return name
     if not isinstance(name, str) or name not in SETUPS:
-        raise SceneError(
-            "no such scene",
-            where=f"scene={name!r}",
-            hint=f"give one of {', '.join(SETUPS)}, or a polar_bayes.Scene",
-        )
+        hint = f"give one of {', '.join(SETUPS)}, or a polar_bayes.Scene"
+        raise SceneError("no such scene", where=f"scene={name!r}", hint=hint)
     return SETUPS[name]
 
 
@@ -118,10 +109,6 @@ def default_priors(setup: Setup, capture: xr.Dataset) -> dict[str, dist.Distribu
         if isinstance(term, Discrepancy):  # as many weights as it has basis functions
             priors["discrepancy_weights"] = dist.Normal(0.0, 1.0).expand([term.basis]).to_event(1)
     return {name: prior for name, prior in priors.items() if name in setup.scene.parameters}
-
-
-DRAWS = 10_000
-LEVELS = (0.025, 0.5, 0.975)
 
 
 def prior_table(
@@ -147,8 +134,8 @@ def prior_table(
     rows = {}
     own = find_setup(scene).priors if isinstance(scene, str | Setup) else {}
     for name, prior in resolve_priors(_names(scene, priors), {**own, **(priors or {})}).items():
-        draws = np.asarray(prior.sample(jax.random.key(0), (DRAWS,)))
-        levels = np.quantile(draws, LEVELS).tolist()
+        draws = np.asarray(prior.sample(jax.random.key(0), (10_000,)))
+        levels = np.quantile(draws, (0.025, 0.5, 0.975)).tolist()
         rows[name] = [*notation(name), describe_prior(prior), *levels]
     columns = ["symbol", "meaning", "unit", "prior", "q2.5", "q50", "q97.5"]
     return PrintedFrame.from_dict(rows, orient="index", columns=columns)

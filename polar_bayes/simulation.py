@@ -23,12 +23,19 @@ from polar_bayes.numerics.compile import compiled
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink, noise_parameters
 from polar_bayes.physics.geometry import Geometry
+from polar_bayes.physics.instrument import (
+    AngleZero,
+    BeamOverlap,
+    ChannelGain,
+    DarkLevel,
+    Discrepancy,
+    DolpGain,
+    Leakage,
+)
 from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import RANGES
 from polar_bayes.setups import SETUPS, Setup, find_setup, setup_name
-
-__all__ = ["PRESETS", "Material", "Protocol", "simulate"]
 
 REFERENCE_WAVELENGTHS = (450.0, 550.0, 650.0)
 
@@ -58,15 +65,11 @@ class Material:
         Returns:
             Scalars for what color does not change, (wavelength,) for the rest.
         """
-
-        def spectral(values: tuple[float, ...]) -> np.ndarray:
-            return np.interp(wavelengths, REFERENCE_WAVELENGTHS, values)
-
+        spectra = {"absorption": self.absorption, "refractive_index": self.refractive_index}
         return {
             "roughness": np.asarray(self.roughness),
             "subsurface_fraction": np.asarray(self.subsurface_fraction),
-            "absorption": spectral(self.absorption),
-            "refractive_index": spectral(self.refractive_index),
+            **{n: np.interp(wavelengths, REFERENCE_WAVELENGTHS, x) for n, x in spectra.items()},
         }
 
 
@@ -85,9 +88,8 @@ PRESETS: Mapping[str, Material] = MappingProxyType(
 def find_preset(name: str) -> Material:
     """The material of that name."""
     if not isinstance(name, str) or name not in PRESETS:
-        raise CaptureError(
-            "no such material", where=f"preset={name!r}", hint=f"give one of {', '.join(PRESETS)}"
-        )
+        hint = f"give one of {', '.join(PRESETS)}"
+        raise CaptureError("no such material", where=f"preset={name!r}", hint=hint)
     return PRESETS[name]
 
 
@@ -150,13 +152,12 @@ class Protocol:
 
 # --- Validation of parameters and noise -----------------------------------------------------------
 
-_ZEROS = ("leakage", "dark_level", "angle_zero", "normal_tilt_x", "normal_tilt_y")
+_TERMS = (AngleZero, BeamOverlap, ChannelGain, DarkLevel, Discrepancy, DolpGain, Leakage)
 
 NEUTRAL: Mapping[str, np.ndarray] = {
-    **dict.fromkeys((*_ZEROS, "discrepancy_amplitude"), np.asarray(0.0)),
-    **dict.fromkeys(("dolp_gain", "channel_gain_ratio"), np.asarray(1.0)),
+    **{name: np.asarray(x) for term in _TERMS for name, x in term.neutral.items()},
+    **dict.fromkeys(("normal_tilt_x", "normal_tilt_y"), np.asarray(0.0)),
     "discrepancy_weights": np.zeros(3),
-    "beam_overlap_zenith": np.asarray(90.0),
 }
 """A perfect instrument and a level sample, by the names of the terms' parameters."""
 
@@ -167,8 +168,7 @@ def checked_parameters(
     scene: Scene, material: Material, wavelengths: np.ndarray, overrides: Mapping[str, Value]
 ) -> dict[str, np.ndarray]:
     """A value for every parameter of the scene."""
-    unknown = set(overrides) - set(scene.parameters)
-    if unknown:
+    if unknown := set(overrides) - set(scene.parameters):
         what = f"the scene has no parameter {', '.join(sorted(unknown))}"
         hint = f"give any of {', '.join(scene.parameters)}"
         raise SceneError(what, where="simulate: parameters", hint=hint)
@@ -199,8 +199,7 @@ def checked_noise(
 ) -> dict[str, np.ndarray | None]:
     """A value for every noise parameter of the links."""
     parameters = noise_parameters(links)
-    unknown = set(overrides) - set(parameters)
-    if unknown:
+    if unknown := set(overrides) - set(parameters):
         what = f"no link reads {', '.join(sorted(unknown))}"
         raise FitError(what, where="simulate: noise", hint=f"give any of {', '.join(parameters)}")
     given: dict[str, Value | None] = {"exposure": None, **defaults, **overrides}
@@ -276,15 +275,8 @@ IMAGE = ("y", "x")
 STATED_ERROR = 0.01
 """Standard error that the instrument states of every reading, for the links that read it."""
 
-FULL_SCALE = 1.0
-BRIGHT_QUANTILE = 0.9
-BRIGHT_LEVEL = 0.6
+BRIGHT_QUANTILE, BRIGHT_LEVEL = 0.9, 0.6
 """Exposure puts the 90% brightest view at 60% of full scale; a specular lobe may saturate."""
-LARGEST_CONTRAST = 1e4
-"""Brightest view over the 90% brightest one beyond which the brightest one sets the exposure.
-
-Outside its highlight a bare mirror is black: no camera exposes for what is left of a lobe there.
-"""
 
 
 def simulate(
@@ -346,9 +338,8 @@ def simulate(
     setup = Setup(scene, SETUPS["paper"].links) if isinstance(scene, Scene) else find_setup(scene)
     links = _checked_links(setup.links if links is None else links)
     if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**32:
-        raise CaptureError(
-            f"seed is {seed!r}", where="simulate", hint="give an integer from 0 to 2**32 - 1"
-        )
+        hint = "give an integer from 0 to 2**32 - 1"
+        raise CaptureError(f"seed is {seed!r}", where="simulate", hint=hint)
     material = preset if isinstance(preset, Material) else find_preset(preset)
     wavelengths = np.asarray(protocol.wavelengths, float)
     truth = checked_parameters(setup.scene, material, wavelengths, parameters or {})
@@ -397,8 +388,10 @@ def _record(
     prediction = scene.predict(parameters, layout.geometry)
     prediction = {n: jnp.broadcast_to(x, layout.shape) for n, x in prediction.items()}
     light = prediction["intensity"]
-    brightest = jnp.max(light) / LARGEST_CONTRAST
-    exposure = BRIGHT_LEVEL / jnp.maximum(jnp.quantile(light, BRIGHT_QUANTILE), brightest)
+    # Outside its highlight a bare mirror is black: no camera exposes for what is left of a lobe
+    # there, so that the brightest view sets the exposure if its contrast is larger than 1e4.
+    bright = jnp.maximum(jnp.quantile(light, BRIGHT_QUANTILE), jnp.max(light) / 1e4)
+    exposure = BRIGHT_LEVEL / bright
     levels = {
         name: exposure if level is None else _align_image(level, axes)
         for name, level in noise.items()
@@ -408,14 +401,9 @@ def _record(
     if "intensity" in link_of:
         link = link_of["intensity"]
         intensity = link.distribution("intensity", prediction, layout, levels).sample(key_intensity)
-        intensity = jnp.clip(intensity, 0.0, FULL_SCALE)
-        recorded["intensity"] = intensity
-        recorded["saturated"] = intensity >= FULL_SCALE
-        data = dataclasses.replace(
-            layout,
-            brightness=jnp.clip(intensity / FULL_SCALE, 0.0, 1.0),
-            saturated=recorded["saturated"],
-        )
+        intensity = jnp.clip(intensity, 0.0, 1.0)  # of full scale
+        recorded |= {"intensity": intensity, "saturated": intensity >= 1.0}
+        data = dataclasses.replace(layout, brightness=intensity, saturated=recorded["saturated"])
     for (name, link), key in zip(links, jax.random.split(key_rest, len(links)), strict=True):
         if name != "intensity":
             recorded[name] = link.distribution(name, prediction, data, levels).sample(key)
@@ -458,7 +446,7 @@ def _layout(
         readings={},
         errors={name: jnp.full(shape, STATED_ERROR) for name in links},
         brightness=jnp.ones(shape),
-        full_scale=jnp.asarray(FULL_SCALE),
+        full_scale=jnp.asarray(1.0),
         intensity_unit=jnp.asarray(1.0),
         valid=jnp.ones(shape, bool),
         saturated=jnp.zeros(shape, bool),
@@ -486,5 +474,5 @@ def _label(
     if protocol.wavelengths:
         capture = capture.assign_coords(wavelength=np.asarray(protocol.wavelengths, float))
     if "intensity" in capture:
-        capture["intensity"].attrs["saturation_level"] = FULL_SCALE
+        capture["intensity"].attrs["saturation_level"] = 1.0
     return validate(capture, source="simulate")

@@ -1,7 +1,6 @@
 """Several captures combined along a leading dim, material or patch, to be fitted together."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Hashable, Mapping, Sequence
 
 import numpy as np
 import xarray as xr
@@ -120,7 +119,7 @@ def _check_labels(label: str, capture: xr.Dataset, first: str, pattern: xr.Datas
             raise CaptureError(what, where=f"combine: {label}", hint=hint)
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     if value is None:
         return "not stated"
     if isinstance(value, xr.Variable):
@@ -143,7 +142,7 @@ def _stacked(name: str, captures: list[xr.Dataset], dim: str) -> xr.Variable:
     return xr.Variable((dim, *dims), np.stack(rows), _common([x.attrs for x in found]))
 
 
-def _padded(name: str, capture: xr.Dataset, dims: list[Any], views: int) -> np.ndarray:
+def _padded(name: str, capture: xr.Dataset, dims: list[Hashable], views: int) -> np.ndarray:
     """A variable of one capture, padded to a number of views."""
     default = xr.Variable((), DEFAULTS.get(name, np.nan))
     variable = capture[name].variable if name in capture else default
@@ -157,11 +156,7 @@ def _padded(name: str, capture: xr.Dataset, dims: list[Any], views: int) -> np.n
     return np.pad(values, widths, constant_values=False if name in FLAGS else np.nan)
 
 
-def _common(attributes: Sequence[Mapping[Any, Any]]) -> dict[Any, Any]:
+def _common(attributes: Sequence[Mapping[Hashable, object]]) -> dict[Hashable, object]:
     """The attributes that are equal in all."""
     first, *others = attributes or ({},)
-    return {
-        name: value
-        for name, value in first.items()
-        if all(name in other and other[name] == value for other in others)
-    }
+    return {n: x for n, x in first.items() if all(n in each and each[n] == x for each in others)}

@@ -19,11 +19,6 @@ from polar_bayes.errors import CaptureError, PolarBayesError
 from polar_bayes.paths import atomic_write, existing_file, system_error
 
 MARK = b"\npolar_bayes sha256 "
-TAIL = 4096
-"""Bytes at the end of a file in which the mark is searched, in case more have been appended."""
-
-RESULT_ATTRIBUTES = ("polar_bayes", "chosen_scene")
-"""Root attributes of results: provenance, and that of a ledger of effects."""
 
 
 def read_netcdf[Data: (xr.Dataset, xr.DataTree)](
@@ -65,7 +60,7 @@ def _is_whole(path: Path) -> bool:
     """Whether the checksum of a file is right, or missing."""
     size = path.stat().st_size
     with path.open("rb") as file:
-        file.seek(max(0, size - TAIL))
+        file.seek(max(0, size - 4096))  # more may have been appended to the last line
         tail = file.read()
     before, mark, line = tail.rpartition(MARK)
     if not mark:
@@ -82,9 +77,6 @@ def _digest(path: Path, size: int) -> str:
             size -= len(block)
     return digest.hexdigest()
 
-
-TABLES = (".csv", ".dat", ".tsv", ".txt")
-"""Endings of files that hold tables."""
 
 # --- Captures -------------------------------------------------------------------------------------
 
@@ -106,7 +98,7 @@ def load_capture(path: str | os.PathLike[str]) -> xr.Dataset:
     """
     file = existing_file(path, "capture")
     hint = "write it again with save_capture"
-    if file.suffix.lower() in TABLES:
+    if file.suffix.lower() in (".csv", ".dat", ".tsv", ".txt"):
         hint = f"a table is imported first: polar-bayes import table {file} --out {file.stem}.nc"
         hint += f", or pb.from_table({str(file)!r})"
     broken = CaptureError("it cannot be read as netCDF", where=str(file), hint=hint)
@@ -141,7 +133,8 @@ def is_capture(file: Path) -> bool:
 
 def is_result(file: Path) -> bool:
     """Whether a file holds a result that `save_result` wrote, of any kind; no value is read."""
-    return any(name in _header(file).attrs for name in RESULT_ATTRIBUTES)
+    # Provenance, and that of a ledger of effects.
+    return not {"polar_bayes", "chosen_scene"}.isdisjoint(_header(file).attrs)
 
 
 def _header(file: Path) -> xr.Dataset:

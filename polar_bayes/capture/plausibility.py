@@ -16,24 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-SMALLEST_INDEX, LARGEST_INDEX = 1.2, 2.5
 SMALLEST_VIEWS = 3
 """Views below which nothing is concluded from their polarization."""
-MIRROR_ZENITH, MIRROR_AZIMUTH = 2.5, 5.0
-"""Departure from the mirror direction, in degrees, within which a view still counts as one."""
-SAME_SIDE_AZIMUTH = 20.0
-JUDGED_ZENITHS = (15.0, 80.0)
-"""Zeniths, in degrees, between which surface and body are polarized enough to be told apart."""
-NOISE_ERRORS, UNSTATED_ERROR = 3.0, 0.03
-OVERPOLARIZED_ERRORS, OVERPOLARIZED_SHARE = 5.0, 0.01
-PI_TOLERANCE = 0.01
-BREWSTER_ZENITHS = (20.0, 85.0)
-BREWSTER_GAP = 10.0
-"""Largest step, in degrees, between mirror views from which Brewster's angle is read by eye."""
-BREWSTER_PEAK, PURE_PEAK = 0.5, 0.9
-"""Polarization from which a peak is one, and from which the surface alone makes it."""
-BREWSTER_DEPTH = 0.05
-"""How far below the top of the peak its width is measured, as a share of the top."""
+PURE_PEAK = 0.9
+"""Polarization of a peak from which the surface alone makes it."""
 DEFAULT_INDICES = (1.2, 2.0)
 """Smallest and largest index that the default priors allow; a test compares them."""
 MAX_LISTED = 4
@@ -163,18 +149,10 @@ def cautions(capture: xr.Dataset) -> tuple[str, ...]:
     Returns:
         A sentence for each, none for a capture in which nothing is unlikely.
     """
-    parts = _materials(capture)
-    return tuple(
-        dict.fromkeys(
-            itertools.chain(
-                _azimuth_cautions(capture),
-                _excess_cautions(capture),
-                *(_sign_cautions(name, part) for name, part in parts),
-                *(_side_cautions(name, part) for name, part in parts),
-                *(_scale_cautions(name, part) for name, part in parts),
-            )
-        )
-    )
+    found = [*_azimuth_cautions(capture), *_excess_cautions(capture)]
+    for check in (_sign_cautions, _side_cautions, _scale_cautions):
+        found += [each for name, part in _materials(capture) for each in check(name, part)]
+    return tuple(dict.fromkeys(found))
 
 
 def inferred(capture: xr.Dataset) -> tuple[str, ...]:
@@ -187,13 +165,10 @@ def inferred(capture: xr.Dataset) -> tuple[str, ...]:
         Sentences on readings, directions, wavelengths, the sign of q and Brewster's angle by eye,
         as far as the capture has them.
     """
-    return tuple(
-        itertools.chain(
-            [_readings_sentence(capture)],
-            *(_sign_sentences(name, part) for name, part in _materials(capture)),
-            *(_brewster_sentences(name, part) for name, part in _materials(capture)),
-        )
-    )
+    found = [_readings_sentence(capture)]
+    for tell in (_sign_sentences, _brewster_sentences):
+        found += [each for name, part in _materials(capture) for each in tell(name, part)]
+    return tuple(found)
 
 
 def stated(capture: xr.Dataset) -> tuple[str, ...]:
@@ -226,11 +201,10 @@ def stated(capture: xr.Dataset) -> tuple[str, ...]:
 
 def _materials(capture: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
     """The capture of each material or patch, with words that name it; an image is one."""
-    dim = next((name for name in ("material", "patch") if name in capture.dims), None)
-    if dim is None:
-        return [("", capture)]
-    labels = capture[dim].values  # numbers from 0 where the capture has none
-    return [(f" of {dim} {label}", capture.isel({dim: k})) for k, label in enumerate(labels)]
+    for dim in (name for name in ("material", "patch") if name in capture.dims):
+        labels = capture[dim].values  # numbers from 0 where the capture has none
+        return [(f" of {dim} {label}", capture.isel({dim: k})) for k, label in enumerate(labels)]
+    return [("", capture)]
 
 
 def _azimuth_difference(capture: xr.Dataset) -> xr.DataArray:
@@ -241,21 +215,29 @@ def _azimuth_difference(capture: xr.Dataset) -> xr.DataArray:
 def _at_mirror(capture: xr.Dataset) -> xr.DataArray:
     """Views at the mirror angle of the light."""
     apart = abs(capture["view_zenith"] - capture["light_zenith"])
-    opposite = _azimuth_difference(capture) >= 180.0 - MIRROR_AZIMUTH
-    return (apart <= MIRROR_ZENITH) & opposite
+    return (apart <= 2.5) & (_azimuth_difference(capture) >= 175.0)
+
+
+def _valid(capture: xr.Dataset) -> xr.DataArray:
+    return capture.get("valid", xr.DataArray(True))
 
 
 def _judged(capture: xr.Dataset, where: xr.DataArray, signal: str) -> xr.DataArray:
     """Measured readings at those views, where the zenith lets surface and body be told apart."""
-    low, high = JUDGED_ZENITHS
-    zenith = capture["view_zenith"]
-    valid = capture.get("valid", xr.DataArray(True))
-    return where & (zenith >= low) & (zenith <= high) & valid & capture[signal].notnull()
+    # Between these zeniths surface and body are polarized enough to be told apart.
+    zenith, known = capture["view_zenith"], _valid(capture) & capture[signal].notnull()
+    return where & (zenith >= 15.0) & (zenith <= 80.0) & known
+
+
+def _mostly(wrong: xr.DataArray, judged: xr.DataArray) -> str:
+    """How many of the judged views are wrong, such as "3 of 4"; empty where fewer than half."""
+    count, total = int((judged & wrong).sum()), int(judged.sum())
+    return f"{count} of {total}" if total >= SMALLEST_VIEWS and 2 * count >= total else ""
 
 
 def _noise(capture: xr.Dataset, signal: str) -> xr.DataArray:
     """How far noise may carry a reading."""
-    return NOISE_ERRORS * capture.get(f"{signal}_error", xr.DataArray(UNSTATED_ERROR))
+    return 3.0 * capture.get(f"{signal}_error", xr.DataArray(0.03))
 
 
 # --- What light can be ----------------------------------------------------------------------------
@@ -270,9 +252,9 @@ def fresnel(zenith: Any, index: float) -> tuple[Any, Any]:
     return s, p
 
 
-def _body_polarization(zenith: Any) -> Any:
+def _body_polarization(zenith: xr.DataArray) -> xr.DataArray:
     """Largest degree of polarization, along p, of light that leaves a body at a zenith."""
-    s, p = fresnel(zenith, LARGEST_INDEX)
+    s, p = fresnel(zenith, 2.5)
     return (s - p) / (2.0 - s - p)
 
 
@@ -281,8 +263,8 @@ def _body_polarization(zenith: Any) -> Any:
 
 def _azimuth_cautions(capture: xr.Dataset) -> Iterator[str]:
     largest = max(float(abs(capture[f"{each}_azimuth"]).max()) for each in ("view", "light"))
-    at_pi = abs(_azimuth_difference(capture) - np.pi) < PI_TOLERANCE
-    if largest <= 2.0 * np.pi + PI_TOLERANCE and bool(at_pi.any()):
+    at_pi = abs(_azimuth_difference(capture) - np.pi) < 0.01
+    if largest <= 2.0 * np.pi + 0.01 and bool(at_pi.any()):
         yield (
             "Viewer and light are pi degrees of azimuth apart, which looks like radians: give 180 "
             "for the mirror side of the light."
@@ -296,14 +278,14 @@ def _excess_cautions(capture: xr.Dataset) -> Iterator[str]:
     q, u = capture["q"], capture["u"]
     degree = (q**2 + u**2) ** 0.5
     error = ((q * capture["q_error"]) ** 2 + (u * capture["u_error"]) ** 2) ** 0.5 / degree
-    valid = degree.notnull() & capture.get("valid", xr.DataArray(True))
-    wrong = valid & (degree > 1.0 + OVERPOLARIZED_ERRORS * error)
+    valid = degree.notnull() & _valid(capture)
+    wrong = valid & (degree > 1.0 + 5.0 * error)
     count, total = int(wrong.sum()), int(valid.sum())
-    if count > OVERPOLARIZED_SHARE * total:
+    if count > 0.01 * total:
         largest = float(degree.where(wrong).max())
         yield (
             f"{count} of {total} readings have sqrt(q^2 + u^2) above 1 by more than "
-            f"{OVERPOLARIZED_ERRORS:g} stated errors (up to {largest:.3g}): "
+            f"5 stated errors (up to {largest:.3g}): "
             "no light has it, so errors are stated too small, or dark level, background or the "
             "gains of the channels are off."
         )
@@ -314,13 +296,10 @@ def _sign_cautions(name: str, capture: xr.Dataset) -> Iterator[str]:
     if "q" not in capture:
         return
     judged = _judged(capture, _at_mirror(capture), "q")
-    below = judged & (
-        capture["q"] < -_body_polarization(capture["view_zenith"]) - _noise(capture, "q")
-    )
-    count, total = int(below.sum()), int(judged.sum())
-    if total >= SMALLEST_VIEWS and 2 * count >= total:
+    least = -_body_polarization(capture["view_zenith"]) - _noise(capture, "q")
+    if share := _mostly(capture["q"] < least, judged):
         yield (
-            f"q{name} is negative at {count} of {total} mirror angles, more than surface and body "
+            f"q{name} is negative at {share} mirror angles, more than surface and body "
             "can make it: s and p are likely swapped, or q is defined with the other sign (here "
             "q > 0 is s light, perpendicular to the plane of normal and viewer); swap them, or "
             "turn the sign."
@@ -333,18 +312,16 @@ def _side_cautions(name: str, capture: xr.Dataset) -> Iterator[str]:
     if signal is None or capture.attrs.get("setup") == "picture":  # light from everywhere
         return
     apart = _azimuth_difference(capture)
-    if not bool((apart <= SAME_SIDE_AZIMUTH).all()):
+    if not bool((apart <= 20.0).all()):
         return
-    judged = _judged(capture, apart <= SAME_SIDE_AZIMUTH, signal)
+    judged = _judged(capture, apart <= 20.0, signal)
     view, light = (np.deg2rad(capture[f"{each}_zenith"]) for each in ("view", "light"))
     cos = np.cos(view) * np.cos(light) + np.sin(view) * np.sin(light) * np.cos(np.deg2rad(apart))
-    s, p = fresnel(0.5 * np.rad2deg(np.arccos(np.clip(cos, -1.0, 1.0))), SMALLEST_INDEX)
+    s, p = fresnel(0.5 * np.rad2deg(np.arccos(np.clip(cos, -1.0, 1.0))), 1.2)
     most = np.maximum((s - p) / (s + p), _body_polarization(capture["view_zenith"]))
-    above = judged & (abs(capture[signal]) > most + _noise(capture, signal))
-    count, total = int(above.sum()), int(judged.sum())
-    if total >= SMALLEST_VIEWS and 2 * count >= total:
+    if share := _mostly(abs(capture[signal]) > most + _noise(capture, signal), judged):
         yield (
-            f"Every view{name} is on the side of the light, and {count} of {total} are polarized "
+            f"Every view{name} is on the side of the light, and {share} are polarized "
             "more than any light that returns there: the detector was likely on the mirror side, "
             "where view_azimuth and light_azimuth are 180 degrees apart."
         )
@@ -411,10 +388,8 @@ def _brewster(capture: xr.Dataset) -> IndexByEye | None:
     signal = next((each for each in ("q", "dop") if each in capture), None)
     if signal is None or {"y", "x"} & set(capture.dims):
         return None
-    low, high = BREWSTER_ZENITHS
     zenith = capture["view_zenith"]
-    used = _at_mirror(capture) & (zenith >= low) & (zenith <= high)
-    used = used & capture.get("valid", xr.DataArray(True))
+    used = _at_mirror(capture) & (zenith >= 20.0) & (zenith <= 85.0) & _valid(capture)
     readings = capture[signal].where(used)
     others = [dim for dim in readings.dims if dim != "view"]
     values = readings.mean(others).to_numpy()  # over wavelengths
@@ -424,7 +399,7 @@ def _brewster(capture: xr.Dataset) -> IndexByEye | None:
     if len(angles) < 2 * SMALLEST_VIEWS:
         return None
     values = np.bincount(position, values) / np.bincount(position)
-    noise = float(_noise(capture, signal).where(used).median()) / NOISE_ERRORS
+    noise = float(_noise(capture, signal).where(used).median()) / 3.0
     return _peak(angles, values, noise)
 
 
@@ -436,13 +411,13 @@ def _peak(angles: np.ndarray, values: np.ndarray, noise: float) -> IndexByEye | 
     smooth[1:-1] = np.median([values[:-2], values[1:-1], values[2:]], axis=0)
     peak = 1 + int(np.argmax(smooth[1:-1]))
     top = float(smooth[peak])
-    level = top - max(2.0 * noise, BREWSTER_DEPTH * top)
+    level = top - max(2.0 * noise, 0.05 * top)
     below = np.flatnonzero(smooth < level)
-    if top < BREWSTER_PEAK or not below.size or not below[0] < peak < below[-1]:
+    if top < 0.5 or not below.size or not below[0] < peak < below[-1]:
         return None
     first, last = below[below < peak][-1], below[below > peak][0]
     step = float(np.diff(angles[first : last + 1]).max())
-    if step > BREWSTER_GAP:
+    if step > 10.0:
         return None
     rises = np.interp(level, smooth[first : first + 2], angles[first : first + 2])
     falls = np.interp(level, smooth[[last, last - 1]], angles[[last, last - 1]])

@@ -34,10 +34,6 @@ SPELLINGS = {
     "nm": ("nm", "nanometer", "nanometers"),
 }
 
-SMALLEST_WAVELENGTH = 10.0
-"""Shorter light, in nm, is X-rays, whose polarization no set-up here measures."""
-LIKELY_PERCENT = 1.5
-"""Polarization beyond it is percent rather than noise or an instrument error of a few percent."""
 SMALLEST_SCAN, LARGEST_SCAN_END = 0.1, 0.2
 """Span and largest zenith below which a scan in radians would be one of a few degrees."""
 
@@ -66,6 +62,11 @@ class Interval:
             return float(value)
         raise CaptureError(f"it is {value!r}", where=where, hint=f"give {self}")
 
+    def check_fields(self, owner: object, *names: str) -> None:
+        """Refuse fields of an object that are no numbers inside."""
+        for name in names:
+            self.check(getattr(owner, name), f"{type(owner).__name__}: {name}")
+
     def __str__(self) -> str:
         """The interval as an inequality."""
         signs = ("<" if self.open_low else "<=", "<" if self.open_high else "<=")
@@ -86,43 +87,50 @@ class Variable:
 
 
 ZENITH = Interval(0.0, 90.0, open_high=True)
-AZIMUTH = Interval(-360.0, 360.0)
 UNIT = Interval(0.0, 1.0)
-SHARE = Interval(0.0, 1.0, open_low=True)
 SIGNED_UNIT = Interval(-1.0, 1.0)
 BRIGHTNESS = Interval(0.0, 1e30, open_high=True)
 POSITIVE = Interval(0.0, 1e30, open_low=True, open_high=True)
 # The inverse square of an error stays finite in double precision.
 ERROR = Interval(1e-30, 1e30, open_low=True, open_high=True)
 
-FROM_NORMAL = "give degrees from the surface normal"
-AROUND_NORMAL = "give degrees around the surface normal"
 MASK = "correct it or mark it valid=False"
 FRACTION = f"give a fraction, not percent; {MASK}"
-TRUST = "give 1 where the normal is sure; what is not to be trusted at all is valid=False"
-SIGMA = f"give a standard deviation above zero; {MASK}"
-ZERO_ONE = "give True or False, or 1 or 0"
-WAVELENGTH_RANGE = dataclasses.replace(POSITIVE, low=SMALLEST_WAVELENGTH, open_low=False)
-NANOMETERS = (
-    "give nanometers: a number around 0.5 is micrometers, to be multiplied by 1000, and one below "
-    "1e-5 is meters"
-)
+
+
+def _direction(name: str) -> tuple[Variable, Variable]:
+    """Zenith and azimuth of viewer or light."""
+    hint, turns = "give degrees from the surface normal", Interval(-360.0, 360.0)
+    zenith, azimuth = f"{name} zenith angle", f"{name} azimuth"
+    return (
+        Variable(f"{name}_zenith", "geometry", "degree", ZENITH, zenith, hint),
+        Variable(
+            f"{name}_azimuth", "geometry", "degree", turns, azimuth, hint.replace("from", "around")
+        ),
+    )
 
 
 def _error(name: str, units: str | None) -> Variable:
     """The error of a reading."""
-    meaning = f"standard deviation of {name}"
-    return Variable(f"{name}_error", "reading", units, ERROR, meaning, SIGMA, name)
+    meaning, hint = f"standard deviation of {name}", f"give a standard deviation above zero; {MASK}"
+    return Variable(f"{name}_error", "reading", units, ERROR, meaning, hint, name)
 
 
-NOT_LIGHT = f"no light has it: check dark level, background and channel gains; {MASK}"
+def _flag(name: str, meaning: str) -> Variable:
+    return Variable(name, "flag", "1", UNIT, meaning, "give True or False, or 1 or 0")
+
 
 CONTRACT = (
-    Variable("view_zenith", "geometry", "degree", ZENITH, "view zenith angle", FROM_NORMAL),
-    Variable("view_azimuth", "geometry", "degree", AZIMUTH, "view azimuth", AROUND_NORMAL),
-    Variable("light_zenith", "geometry", "degree", ZENITH, "light zenith angle", FROM_NORMAL),
-    Variable("light_azimuth", "geometry", "degree", AZIMUTH, "light azimuth", AROUND_NORMAL),
-    Variable("normal_confidence", "trust", "1", SHARE, "trust in the stated normal", TRUST),
+    *_direction("view"),
+    *_direction("light"),
+    Variable(
+        "normal_confidence",
+        "trust",
+        "1",
+        Interval(0.0, 1.0, open_low=True),
+        "trust in the stated normal",
+        "give 1 where the normal is sure; what is not to be trusted at all is valid=False",
+    ),
     Variable("dop", "reading", "1", UNIT, "degree of linear polarization", FRACTION),
     Variable("q", "reading", "1", SIGNED_UNIT, "normalized Stokes q, s positive", FRACTION),
     Variable("u", "reading", "1", SIGNED_UNIT, "normalized Stokes u", FRACTION, "q"),
@@ -131,14 +139,23 @@ CONTRACT = (
     _error("q", "1"),
     _error("u", "1"),
     _error("intensity", None),
-    Variable("saturated", "flag", "1", UNIT, "the detector saturated", ZERO_ONE),
-    Variable("valid", "flag", "1", UNIT, "measured, not missing", ZERO_ONE),
-    Variable("interpolated", "flag", "1", UNIT, "filled in between readings", ZERO_ONE),
+    _flag("saturated", "the detector saturated"),
+    _flag("valid", "measured, not missing"),
+    _flag("interpolated", "filled in between readings"),
 )
-WAVELENGTH = Variable("wavelength", "label", "nm", WAVELENGTH_RANGE, "wavelength", NANOMETERS)
+WAVELENGTH = Variable(
+    "wavelength",
+    "label",
+    "nm",
+    # Shorter light is X-rays, whose polarization no set-up here measures.
+    dataclasses.replace(POSITIVE, low=10.0, open_low=False),
+    "wavelength",
+    "give nanometers: a number around 0.5 is micrometers, to be multiplied by 1000, and one below "
+    "1e-5 is meters",
+)
 
 
-def as_numbers(values: Any) -> np.ndarray:
+def as_numbers(values: object) -> np.ndarray:
     """An array of float64; a single NaN in place of what is no array of numbers."""
     try:
         return np.asarray(values, dtype=np.float64)
@@ -179,25 +196,19 @@ class Layout:
 # --- Attributes: text and numbers, which every file format can hold -------------------------------
 
 
-NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.+-]{0,99}")
-
-# xarray gives these a meaning of its own when it writes netCDF.
-RESERVED = frozenset({"add_offset", "coordinates", "dtype", "missing_value", "scale_factor"})
-
-
-def clean_attributes(attributes: Mapping[Any, Any], where: str) -> dict[str, str | int | float]:
+def clean_attributes(attributes: Mapping[Any, object], where: str) -> dict[str, str | int | float]:
     """Attributes as plain text and numbers, so that a file gives back what was saved."""
+    # xarray gives these a meaning of its own when it writes netCDF.
+    reserved = {"add_offset", "coordinates", "dtype", "missing_value", "scale_factor"}
+    allowed = re.compile(r"[A-Za-z][A-Za-z0-9_.+-]{0,99}")
     # Numbers become Python numbers, truth values 0 or 1; bytes and arrays of numbers or text
     # become text.
     for name in attributes:
-        if not isinstance(name, str) or not NAME.fullmatch(name) or name in RESERVED:
+        if not isinstance(name, str) or not allowed.fullmatch(name) or name in reserved:
             what = f"the attribute name {name!r} cannot be stored"
             hint = "rename it: a letter, then letters, digits or any of _ . + -"
             raise CaptureError(what, where=where, hint=hint)
-    return {
-        name: _clean_value(value, f"{where}: attribute {name}")
-        for name, value in attributes.items()
-    }
+    return {name: _clean_value(x, f"{where}: attribute {name}") for name, x in attributes.items()}
 
 
 def _clean_value(value: object, where: str) -> str | int | float:
@@ -223,10 +234,6 @@ def _clean_value(value: object, where: str) -> str | int | float:
 
 
 # --- Validation -----------------------------------------------------------------------------------
-
-
-ANGLE_SETTERS = ("stage", "hand", "lens")
-"""How the angles of a capture may have been set: by a rotary stage, by hand, through a lens."""
 
 
 def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
@@ -256,36 +263,27 @@ def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
     _check_names(dataset, source)
     layout = _layout(dataset, source)
     present = [row for row in CONTRACT if row.name in dataset]
-    flags = {
-        row.name: _entries(dataset, row, layout, source) for row in present if row.kind == "flag"
-    }
+    flags = [row for row in present if row.kind == "flag"]
+    found = {row.name: _entries(dataset, row, layout, source) for row in flags}
     valid = np.ones([dataset.sizes[dim] for dim in layout.readings], dtype=bool)
-    if "valid" in flags:
-        valid = flags["valid"].values
+    if "valid" in found:
+        valid = found["valid"].values
     if not valid.any():
         hint = "mark what was measured valid=True"
         raise CaptureError("every view is masked", where=f"{source}: valid", hint=hint)
-    numbers = {
-        row.name: _entries(dataset, row, layout, source, valid)
-        for row in present
-        if row.kind != "flag"
-    }
+    rest = [row for row in present if row.kind != "flag"]
+    numbers = {row.name: _entries(dataset, row, layout, source, valid) for row in rest}
     _check_degrees(numbers, source)
     _check_polarization(numbers, layout, valid, source)
     _check_intensity_units(numbers, source)
-    if dataset.attrs.get("angle_set_by", "hand") not in ANGLE_SETTERS:
-        what, hint = "no such way to set an angle", f"give one of {', '.join(ANGLE_SETTERS)}"
+    # By a rotary stage, by hand, or through a lens.
+    if dataset.attrs.get("angle_set_by", "hand") not in ("stage", "hand", "lens"):
+        what, hint = "no such way to set an angle", "give one of stage, hand, lens"
         raise CaptureError(what, where=f"{source}: attribute angle_set_by", hint=hint)
-    truths = {
-        str(name): _truth(variable, str(name), layout, source)
-        for name, variable in dataset.variables.items()
-        if TRUTH.fullmatch(str(name))
-    }
-    return xr.Dataset(
-        {**numbers, **flags, **truths},
-        coords=_labels(dataset, layout, source),
-        attrs=clean_attributes(dataset.attrs, source),
-    )
+    names = [str(name) for name in dataset.variables if TRUTH.fullmatch(str(name))]
+    truths = {name: _truth(dataset.variables[name], name, layout, source) for name in names}
+    labels, attributes = _labels(dataset, layout, source), clean_attributes(dataset.attrs, source)
+    return xr.Dataset({**numbers, **found, **truths}, labels, attributes)
 
 
 def count(capture: xr.Dataset) -> dict[str, int]:
@@ -363,11 +361,7 @@ def dims_text(dims: Iterable[Hashable]) -> str:
 
 
 def _entries(
-    dataset: xr.Dataset,
-    row: Variable,
-    layout: Layout,
-    source: str,
-    valid: np.ndarray | bool = True,
+    dataset: xr.Dataset, row: Variable, layout: Layout, source: str, valid: np.ndarray | bool = True
 ) -> xr.Variable:
     """A variable of the contract in canonical form; readings that are not valid are not checked."""
     variable = _ordered(dataset[row.name].variable, row, layout, source)
@@ -391,8 +385,9 @@ def hint_for(row: Variable, wrong: np.ndarray) -> str:
     if row.name in SIGNALS and np.isnan(wrong).any():
         return f"{MASK}, as by capture['valid'] = capture[{row.name!r}].notnull()"
     is_polarization = row.kind == "reading" and row.hint == FRACTION
-    if is_polarization and np.all(np.abs(wrong) <= LIKELY_PERCENT):  # False where one is NaN
-        return NOT_LIGHT
+    # Beyond 1.5 it is percent rather than noise or an instrument error of a few percent.
+    if is_polarization and np.all(np.abs(wrong) <= 1.5):  # False where one is NaN
+        return f"no light has it: check dark level, background and channel gains; {MASK}"
     return row.hint
 
 

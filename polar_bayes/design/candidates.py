@@ -2,12 +2,13 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import xarray as xr
 from jaxtyping import Bool, Float
 
+from polar_bayes.capture.schema import dims_text
 from polar_bayes.design.setup import DesignProblem
 from polar_bayes.errors import FitError
 from polar_bayes.inference.request import Request
@@ -21,9 +22,6 @@ from polar_bayes.setups import SETUPS
 
 Directions = Float[np.ndarray, "view 4"]
 """View zenith and azimuth, light zenith and azimuth, in degree."""
-
-SAME_DIRECTION = 1e-4
-"""Directions within so many degrees are one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,23 +47,19 @@ class Constraints:
     from_light: float = 0.0
     minimum_separation: float = 0.0
     repeatable: bool = False
+    # Directions within so many degrees are one.
+    same_direction: ClassVar[float] = 1e-4
 
     def __post_init__(self) -> None:
         for name in ("view_zenith", "light_zenith"):
             low, high = getattr(self, name)
             if not 0.0 <= low <= high <= 90.0:
-                raise FitError(
-                    f"{name} is ({low:g}, {high:g})",
-                    where="Constraints",
-                    hint="give two rising angles from 0 to 90 degrees",
-                )
+                hint = "give two rising angles from 0 to 90 degrees"
+                raise FitError(f"{name} is ({low:g}, {high:g})", where="Constraints", hint=hint)
         for name in ("from_light", "minimum_separation"):
-            if not 0.0 <= getattr(self, name) <= 180.0:
-                raise FitError(
-                    f"{name} is {getattr(self, name):g}",
-                    where="Constraints",
-                    hint="give degrees from 0 to 180",
-                )
+            if not 0.0 <= (angle := getattr(self, name)) <= 180.0:
+                hint = "give degrees from 0 to 180"
+                raise FitError(f"{name} is {angle:g}", where="Constraints", hint=hint)
 
     def allows(self, candidates: Directions, measured: Directions) -> Bool[np.ndarray, " view"]:
         """Which candidates can be taken, given the views that were measured."""
@@ -80,19 +74,17 @@ class Constraints:
         """Which pairs of candidates exclude each other; a view itself, if it is not repeatable."""
         near = self._too_near(candidates, candidates)
         if self.repeatable:
-            near &= _distance(candidates, candidates) > SAME_DIRECTION
+            near &= _distance(candidates, candidates) > self.same_direction
         return near
 
     def _too_near(self, some: Directions, others: Directions) -> Bool[np.ndarray, "some other"]:
-        return _distance(some, others) < max(self.minimum_separation, SAME_DIRECTION)
+        return _distance(some, others) < max(self.minimum_separation, self.same_direction)
 
 
 def _distance(some: Directions, others: Directions) -> Float[np.ndarray, "some other"]:
     """The larger of the angles between two viewers and between two lights."""
-    return np.maximum(
-        _angle(some[:, None, :2], others[None, :, :2]),
-        _angle(some[:, None, 2:], others[None, :, 2:]),
-    )
+    viewers = _angle(some[:, None, :2], others[None, :, :2])
+    return np.maximum(viewers, _angle(some[:, None, 2:], others[None, :, 2:]))
 
 
 def _angle(some: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -116,18 +108,13 @@ def candidate_links(
         readings = (readings,)
     given = dict(readings) if isinstance(readings, Mapping) else dict.fromkeys(readings)
     found = {name: _link_of(request, name, link) for name, link in given.items()}
+    where = "next_views: readings"
     if not found:
-        raise FitError(
-            "new views record nothing",
-            where="next_views: readings",
-            hint=f"give some of {', '.join(READINGS)}",
-        )
+        hint = f"give some of {', '.join(READINGS)}"
+        raise FitError("new views record nothing", where=where, hint=hint)
     if "dop" in found and {"q", "u"} & set(found):
-        raise FitError(
-            "the degree of polarization is made of q and u, and would count twice",
-            where="next_views: readings",
-            hint="leave out dop, or q and u",
-        )
+        what = "the degree of polarization is made of q and u, and would count twice"
+        raise FitError(what, where=where, hint="leave out dop, or q and u")
     return found
 
 
@@ -135,26 +122,20 @@ def _link_of(request: Request, name: str, given: AbstractLink | None) -> Abstrac
     """The link that was given, or that of the capture, of related readings, or of the set-up."""
     where = f"next_views: readings: {name!r}"
     if name not in READINGS:
-        raise FitError(
-            "there is no such reading", where=where, hint=f"give some of {', '.join(READINGS)}"
-        )
+        hint = f"give some of {', '.join(READINGS)}"
+        raise FitError("there is no such reading", where=where, hint=hint)
     setups = (request.scene_name, str(request.capture.attrs.get("setup")))
     setup = next((SETUPS[key] for key in setups if key in SETUPS), None)
     known = dict(setup.links) if setup is not None else {}
     known |= {n: link for link in request.links.values() for n in link.observables}
     link = given or request.links.get(name) or known.get(name)
     if link is None or name not in link.observables:
-        raise FitError(
-            f"the noise of {name} is not known",
-            where=where,
-            hint=f"give its link: readings={{{name!r}: ...}}",
-        )
+        hint = f"give its link: readings={{{name!r}: ...}}"
+        raise FitError(f"the noise of {name} is not known", where=where, hint=hint)
     if link != request.links.get(name, link):
-        raise FitError(
-            f"new readings of {name} have another link than those that were measured",
-            where=where,
-            hint=f"leave out its link, which is {request.links[name]!r}",
-        )
+        what = f"new readings of {name} have another link than those that were measured"
+        hint = f"leave out its link, which is {request.links[name]!r}"
+        raise FitError(what, where=where, hint=hint)
     return link
 
 
@@ -163,9 +144,6 @@ def _link_of(request: Request, name: str, given: AbstractLink | None) -> Abstrac
 
 PLACEHOLDERS = {"dop": 0.5, "q": 0.0, "u": 0.0, "intensity": 0.0}
 """Readings of views that were not taken; the expected information does not depend on them."""
-
-STEP = 2.5
-"""Degrees between the zeniths of the default candidates."""
 
 
 class CandidateViews(NamedTuple):
@@ -186,10 +164,10 @@ def view_directions(views: xr.Dataset) -> Directions:
     return np.stack(columns, axis=-1).astype(float)
 
 
-def default_candidates(capture: xr.Dataset, limit: float) -> xr.Dataset:
+def _default_candidates(capture: xr.Dataset, limit: float) -> xr.Dataset:
     """Views every 2.5 degrees in the azimuths and under the lights that the capture has."""
     measured = view_directions(capture)
-    zeniths = np.arange(STEP, min(limit, 87.5) + 1e-9, STEP)
+    zeniths = np.arange(2.5, min(limit, 87.5) + 1e-9, 2.5)
     # Where the light's zenith mirrors the viewer's in every view, as on a goniometer, it does so
     # in the candidates.
     if np.allclose(measured[:, 0], measured[:, 2]) and np.ptp(measured[:, 0]) > 0.0:
@@ -201,9 +179,12 @@ def default_candidates(capture: xr.Dataset, limit: float) -> xr.Dataset:
 
 
 def join_candidates(
-    capture: xr.Dataset, candidates: xr.Dataset, readings: Sequence[str]
+    request: Request, candidates: xr.Dataset | None, readings: Sequence[str]
 ) -> CandidateViews:
     """Append candidates to the views of a capture."""
+    capture = request.capture
+    if candidates is None:
+        candidates = _default_candidates(capture, request.largest_view_zenith)
     candidates = _checked(capture, candidates)
     wavelengths = _measured_wavelengths(capture, candidates)
     old = _with_readings(capture, candidates, readings)
@@ -219,11 +200,10 @@ def join_candidates(
         new[name] = xr.full_like(new[name], PLACEHOLDERS[name])
     for name in (*(f"{reading}_error" for reading in READINGS), "normal_confidence"):
         if name in old and "view" in old[name].dims:
-            given = candidates.get(name)
-            default = old[name].median("view")
-            new[name] = _filled(
-                new[name], default if given is None else given.drop_vars(given.coords)
-            )
+            errors = old[name].median("view")
+            if name in candidates:
+                errors = candidates[name].drop_vars(candidates[name].coords)
+            new[name] = _filled(new[name], errors)
     joined = xr.concat(
         [old, new], dim="view", data_vars="minimal", coords="minimal", compat="override"
     )
@@ -257,11 +237,8 @@ def _checked(capture: xr.Dataset, candidates: xr.Dataset) -> xr.Dataset:
     """The candidates' angles, errors and wavelengths, with the capture's light if it has one."""
     where = "next_views: candidates"
     if not isinstance(candidates, xr.Dataset) or "view" not in candidates.dims:
-        raise FitError(
-            "they are no views",
-            where=where,
-            hint="give an xarray.Dataset with view_zenith and view_azimuth over a dim view",
-        )
+        hint = "give an xarray.Dataset with view_zenith and view_azimuth over a dim view"
+        raise FitError("they are no views", where=where, hint=hint)
     errors = (f"{name}_error" for name in READINGS)
     used = [n for n in (*ANGLES, "wavelength", *errors) if n in candidates.variables]
     candidates = candidates[used]
@@ -269,29 +246,21 @@ def _checked(capture: xr.Dataset, candidates: xr.Dataset) -> xr.Dataset:
         if name not in candidates:
             same = np.unique(capture[name].to_numpy())
             if not name.startswith("light") or same.size > 1:
-                raise FitError(
-                    "it is missing",
-                    where=f"{where}: {name}",
-                    hint=f"add {name} in degree, with dim view",
-                )
+                hint = f"add {name} in degree, with dim view"
+                raise FitError("it is missing", where=f"{where}: {name}", hint=hint)
             candidates[name] = ("view", np.full(candidates.sizes["view"], same[0]))
         if candidates[name].dims != ("view",):
-            raise FitError(
-                f"its dims are ({', '.join(map(str, candidates[name].dims))})",
-                where=f"{where}: {name}",
-                hint="give it the one dim view",
-            )
+            what = f"its dims are {dims_text(candidates[name].dims)}"
+            raise FitError(what, where=f"{where}: {name}", hint="give it the one dim view")
         angle = candidates[name].to_numpy()
         inside = np.isfinite(angle)
         if name.endswith("zenith"):
             inside &= (angle >= 0.0) & (angle < 90.0)
         if not inside.all():
             at = int(np.argmin(inside))
-            raise FitError(
-                f"{angle[at]:g} is no direction",
-                where=f"{where}: {name}[view={at}]",
-                hint="give degrees; a zenith is from 0 to below 90",
-            )
+            what = f"{angle[at]:g} is no direction"
+            hint = "give degrees; a zenith is from 0 to below 90"
+            raise FitError(what, where=f"{where}: {name}[view={at}]", hint=hint)
     return candidates
 
 
@@ -303,16 +272,13 @@ def _measured_wavelengths(
     if "wavelength" not in candidates.coords:
         return np.ones(capture.sizes.get("wavelength", 1), bool)
     if "wavelength" not in capture.coords or capture["wavelength"].ndim == 0:
-        raise FitError(
-            "the capture has no wavelengths", where=where, hint="leave the coordinate out"
-        )
+        hint = "leave the coordinate out"
+        raise FitError("the capture has no wavelengths", where=where, hint=hint)
     known = capture["wavelength"].to_numpy()
     asked = np.atleast_1d(candidates["wavelength"].to_numpy())
     unknown = asked[~np.isin(asked, known)]
     if unknown.size:
-        raise FitError(
-            f"{unknown[0]:g} nm has parameters of its own, which the capture does not determine",
-            where=where,
-            hint=f"give some of {', '.join(f'{x:g}' for x in known)}",
-        )
+        what = f"{unknown[0]:g} nm has parameters of its own, which the capture does not determine"
+        hint = f"give some of {', '.join(f'{x:g}' for x in known)}"
+        raise FitError(what, where=where, hint=hint)
     return np.isin(known, asked)

@@ -36,6 +36,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.program import Program
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.distributions import MeanConcentrationBeta, SensorStudentT
+from polar_bayes.priors import unwrapped
 
 # --- Fisher information of one reading about the parameters of its own distribution ---------------
 
@@ -58,29 +59,15 @@ class FisherInformation(NamedTuple):
 def information(distribution: dist.Distribution) -> FisherInformation:
     """Fisher information of one reading about the parameters of its distribution."""
     shape = distribution.batch_shape
-    distribution = _unwrapped(distribution)
+    distribution = unwrapped(distribution)
     formula = _FORMULAS.get(type(distribution))
     if formula is None:
-        raise FitError(
-            f"the Fisher information of {type(distribution).__name__} is not known",
-            where="identify",
-            hint=f"use a link that gives one of {', '.join(f.__name__ for f in _FORMULAS)}",
-        )
+        what = f"the Fisher information of {type(distribution).__name__} is not known"
+        hint = f"use a link that gives one of {', '.join(f.__name__ for f in _FORMULAS)}"
+        raise FitError(what, where="identify", hint=hint)
     parameters, matrix = formula(distribution)
-    size = len(parameters)
-    return FisherInformation(
-        tuple(jnp.broadcast_to(x, shape) for x in parameters),
-        jnp.broadcast_to(matrix, (*shape, size, size)),
-    )
-
-
-def _unwrapped(distribution: dist.Distribution) -> dist.Distribution:
-    """A distribution without masks, expansions and event dimensions around it."""
-    while isinstance(
-        distribution, dist.MaskedDistribution | dist.ExpandedDistribution | dist.Independent
-    ):
-        distribution = distribution.base_dist
-    return distribution
+    parameters = tuple(jnp.broadcast_to(x, shape) for x in parameters)
+    return FisherInformation(parameters, jnp.broadcast_to(matrix, (*shape, *matrix.shape[-2:])))
 
 
 def _symmetric(first: Array, across: Array, second: Array) -> Array:
@@ -198,7 +185,7 @@ def reading_information(
         for name in program.observed:
             distribution = trace[name]["fn"]
             found = information(distribution)
-            is_beta = isinstance(_unwrapped(distribution), MeanConcentrationBeta)
+            is_beta = isinstance(unwrapped(distribution), MeanConcentrationBeta)
             parameters[name] = jnp.stack(found.parameters, axis=-1)
             aux[name] = found.information, found.parameters[1] if is_beta else None
         return parameters, aux
@@ -215,10 +202,8 @@ def reading_information(
 
 def total_information(readings: Mapping[str, ReadingInformation]) -> Float[Array, "size size"]:
     """Fisher information of all readings about the unconstrained coordinates."""
-    parts = [
-        jnp.einsum("...ki,...kl,...lj->ij", each.jacobian, each.information, each.jacobian)
-        for each in readings.values()
-    ]
+    total = functools.partial(jnp.einsum, "...ki,...kl,...lj->ij")
+    parts = [total(each.jacobian, each.information, each.jacobian) for each in readings.values()]
     return jnp.sum(jnp.stack(parts), axis=0)
 
 
@@ -248,10 +233,8 @@ def paper_information(
 
     def weighted_sum(weights: list[Array]) -> Array:
         means = [each.jacobian[..., 0, :] for each in of_beta]
-        parts = [
-            jnp.einsum("...i,...,...j->ij", mean, weight, mean)
-            for mean, weight in zip(means, weights, strict=True)
-        ]
+        pairs = zip(means, weights, strict=True)
+        parts = [jnp.einsum("...i,...,...j->ij", mean, weight, mean) for mean, weight in pairs]
         return jnp.sum(jnp.stack(parts), axis=0)
 
     return (

@@ -159,21 +159,11 @@ def _identify_at(problem: DesignProblem, mode: np.ndarray) -> xr.Dataset:
 UNDETERMINED, PARTLY = 0.8, 0.3
 """Share of the prior in a parameter's variance from which it is not, or only partly, determined."""
 
-LARGE_CORRELATION = 0.9
-"""Correlation from which two parameters trade off."""
-
-WEAK = 1.0
-"""Information along a direction, over the prior's, below which the prior determines more of it."""
-
-PART = 0.3
-"""Share of the largest movement of the readings from which a parameter is named in a direction."""
-
-COLUMNS = ["value", "prior_sd", "expected_sd", "prior_share", "sensitivity", "paper_sd"]
-
 
 def identifiability_table(found: xr.Dataset) -> pd.DataFrame:
     """What `identify` found, one row for each parameter."""
-    return found[COLUMNS].drop_vars("name").to_dataframe()
+    columns = ["value", "prior_sd", "expected_sd", "prior_share", "sensitivity", "paper_sd"]
+    return found[columns].drop_vars("name").to_dataframe()
 
 
 def identifiability_sentences(found: xr.Dataset) -> list[str]:
@@ -201,10 +191,11 @@ def _weakest_direction(found: xr.Dataset, is_material: np.ndarray) -> list[str]:
     """The direction of least information, where its parameters one by one would be determined."""
     weakest = found.isel(direction=0)
     weight, movement = weakest["weight"].to_numpy(), weakest["movement"].to_numpy()
-    parts = np.flatnonzero(movement >= PART * movement.max())
+    parts = np.flatnonzero(movement >= 0.3 * movement.max())
     strength = float(weakest["information"])
     is_mixture = parts.size > 1 and movement.max() > 2.0
-    if strength >= WEAK or not is_mixture or not is_material[np.argmax(np.abs(weight))]:
+    # From 1 on the readings determine more of the direction than the prior does.
+    if strength >= 1.0 or not is_mixture or not is_material[np.argmax(np.abs(weight))]:
         return []
     names = found["parameter"].to_numpy()
     parts = parts[np.argsort(-np.abs(weight[parts]))]
@@ -225,7 +216,7 @@ def _correlated_pairs(found: xr.Dataset, is_material: np.ndarray) -> list[str]:
         (i, j)
         for i in np.flatnonzero(first)
         for j in np.flatnonzero(second)
-        if (i < j or not first[j]) and abs(correlation[i, j]) >= LARGE_CORRELATION
+        if (i < j or not first[j]) and abs(correlation[i, j]) >= 0.9
     ]
     return [
         f"{names[i]} and {names[j]} trade off: raising one "

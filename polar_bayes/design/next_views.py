@@ -20,7 +20,6 @@ from polar_bayes.design.candidates import (
     CandidateViews,
     Constraints,
     candidate_links,
-    default_candidates,
     join_candidates,
     view_directions,
 )
@@ -40,12 +39,10 @@ from polar_bayes.design.setup import (
     PRIOR_DRAWS,
     DesignProblem,
     coordinate_indices,
-    fit_draws,
     label_parameters,
-    laplace_draws,
     make_design_problem,
     parameter_vector,
-    posterior_modes,
+    posterior_draws,
     provenance_attrs,
 )
 from polar_bayes.errors import FitError
@@ -60,10 +57,6 @@ from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 from polar_bayes.progress import Progress, with_progress
 from polar_bayes.scenes.scene_file import arguments_of
-
-APART = ("wavelength", "reading")
-WIDTH = 2.0 * 1.959963984540054
-"""Width of a 95% interval, in standard deviations of a normal distribution."""
 
 
 class Design(NamedTuple):
@@ -154,8 +147,7 @@ def next_views(
         By `pick`, the most useful first: `candidate` (its number), the four angles, and
         `wavelength` and `reading` where they were apart. By `step` (0: the capture alone; then
         after each pick): `criterion`, and by `parameter` of the material `expected_sd` (root of
-        the variance averaged over the draws) and `interval_width` of the 95% interval, in its own
-        unit.
+        the variance averaged over the draws) and `interval_width` of the 95% interval.
 
     Raises:
         CaptureError: The capture does not hold what a fit needs.
@@ -165,18 +157,7 @@ def next_views(
         Fedorov (1972), Theory of Optimal Experiments; Chaloner & Verdinelli (1995), Statistical
         Science 10, 273-304, for the average over the posterior.
     """
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1 or draws < 1:
-        raise FitError(
-            f"count is {count} and draws is {draws}",
-            where="next_views",
-            hint="give whole numbers of at least 1",
-        )
-    if set(apart) - set(APART):
-        raise FitError(
-            f"apart is {tuple(apart)}",
-            where="next_views",
-            hint=f"give some of {', '.join(APART)}",
-        )
+    _check_choice(count, draws, apart)
     if isinstance(capture, xr.DataTree):
         asked = arguments_of(capture)
         model, scene = asked.get("model", model), scene or asked.get("scene")
@@ -184,22 +165,37 @@ def next_views(
         if largest_view_zenith is None:
             largest_view_zenith = asked.get("largest_view_zenith")
         result, capture = result or capture, capture_of(capture)
-    criterion, constraints = criterion or DOptimal(), constraints or Constraints()
     request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, "double")
     with jax.enable_x64(True):
         problem = make_design_problem(request)
         new = candidate_links(problem, readings)
-        if candidates is None:
-            candidates = default_candidates(request.capture, request.largest_view_zenith)
-        views = join_candidates(request.capture, candidates, [*request.links, *new])
+        views = join_candidates(request, candidates, [*request.links, *new])
         extended = _extended(problem, views, new, model, priors)
-        indices = coordinate_indices(problem.program, extended.program)
-        if result is None:
-            drawn = laplace_draws(posterior_modes(problem, progress), draws, seed)
-        else:
-            drawn = fit_draws(problem, result, draws)
-        labels = label_parameters(extended)
-        design = _design(problem, extended, views, drawn, indices, tuple(new), tuple(apart))
+        drawn = posterior_draws(problem, result, draws, progress)
+        design = _design(problem, extended, views, drawn, tuple(new), tuple(apart))
+        return _selected(extended, views, design, criterion, constraints, count)
+
+
+def _check_choice(count: object, draws: int, apart: Sequence[str]) -> None:
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1 or draws < 1:
+        what, hint = f"count is {count} and draws is {draws}", "give whole numbers of at least 1"
+        raise FitError(what, where="next_views", hint=hint)
+    if set(apart) - {"wavelength", "reading"}:
+        hint = "give some of wavelength, reading"
+        raise FitError(f"apart is {tuple(apart)}", where="next_views", hint=hint)
+
+
+def _selected(
+    extended: DesignProblem,
+    views: CandidateViews,
+    design: Design,
+    criterion: AbstractCriterion | None,
+    constraints: Constraints | None,
+    count: int,
+) -> xr.Dataset:
+    """The candidates that lower the criterion most, and what they are expected to do."""
+    criterion, constraints = criterion or DOptimal(), constraints or Constraints()
+    request, labels = extended.request, label_parameters(extended)
     rows = [i for i, one in enumerate(labels.scalars) if one.name in MATERIAL_PARAMETERS]
     rows = rows or list(range(len(labels.scalars)))
     names, unit = [labels.names[row] for row in rows], labels.prior_sd[rows]
@@ -209,21 +205,16 @@ def next_views(
         covariance = design.covariance(information) / np.outer(unit, unit)
         return np.mean(criterion.loss(covariance, names), axis=0)
 
-    allowed = constraints.allows(views.directions, view_directions(request.capture))
+    measured = view_directions(request.capture)[: views.measured]
+    allowed = constraints.allows(views.directions, measured)
     allowed &= views.directions[:, 0] <= request.largest_view_zenith
     useful = np.einsum("kvii->v", design.each) > 0.0  # a wavelength that is not measured adds none
     conflicts = design.conflicts(constraints.conflicts(views.directions), constraints.repeatable)
-    selection = fedorov_exchange(
-        loss, design.base, design.each, allowed[design.view] & useful, conflicts, count
-    )
-    found = _assemble(request.capture, views, design, selection, names)
-    provenance = provenance_attrs(
-        extended.request,
-        criterion=repr(criterion),
-        constraints=repr(constraints),
-        exchanges=selection.exchanges,
-    )
-    return found.assign_attrs(provenance)
+    options = allowed[design.view] & useful
+    selection = fedorov_exchange(loss, design.base, design.each, options, conflicts, count)
+    asked = {"criterion": repr(criterion), "constraints": repr(constraints)}
+    provenance = provenance_attrs(request, **asked, exchanges=selection.exchanges)
+    return _assemble(views, design, selection, names).assign_attrs(provenance)
 
 
 def _extended(
@@ -236,24 +227,18 @@ def _extended(
     """The model on measured views and candidates together."""
     links = {**problem.request.links, **new}
     limit, seed = problem.request.largest_view_zenith, problem.request.seed
-    request = resolve(
-        views.capture, model, problem.request.scene, priors, links, limit, seed, "double"
-    )
+    scene = problem.request.scene
+    request = resolve(views.capture, model, scene, priors, links, limit, seed, "double")
     data = observe_request(request)
     recorded = jnp.broadcast_to(problem.data.brightness, problem.data.shape)
     rest = jnp.full((*data.shape[:-1], data.shape[-1] - views.measured), jnp.median(recorded))
     data = dataclasses.replace(data, brightness=jnp.concatenate([recorded, rest], axis=-1))
     compiled_model = compile_model(request, data)
-    data = compiled_model.free(data)
-    program = compiled_model.program
-    unknown = [name for name in new if name not in program.observed]
-    if unknown:
-        raise FitError(
-            f"the model does not observe {unknown[0]}",
-            where="next_views: readings",
-            hint=f"give some of {', '.join(program.observed)}",
-        )
-    prior = problem.prior
+    data, program, prior = compiled_model.free(data), compiled_model.program, problem.prior
+    for name in (name for name in new if name not in program.observed):
+        hint = f"give some of {', '.join(program.observed)}"
+        what = f"the model does not observe {name}"
+        raise FitError(what, where="next_views: readings", hint=hint)
     if program.size != problem.program.size:
         prior = from_prior(program, jax.random.key(seed), PRIOR_DRAWS, data)
     return DesignProblem(request, data, compiled_model, prior)
@@ -264,23 +249,20 @@ def _design(
     extended: DesignProblem,
     views: CandidateViews,
     draws: np.ndarray,
-    indices: np.ndarray,
     new: tuple[str, ...],
     apart: tuple[str, ...],
 ) -> Design:
     """The information of every candidate at every draw, from one compiled program."""
     program, data, count = extended.program, extended.data, len(draws)
+    indices = coordinate_indices(problem.program, program)
     z = extended.prior[np.arange(count) % len(extended.prior)].copy()  # for parameters of the new
     z[:, indices] = draws
     center = np.median(extended.prior, axis=0)
     center[indices] = np.median(draws, axis=0)
     by_wavelength = "wavelength" in apart
     if by_wavelength and [name for name, _ in data.dims][-2:] != ["wavelength", "view"]:
-        raise FitError(
-            "the capture has no wavelengths to choose from",
-            where="next_views: apart",
-            hint="leave wavelength out",
-        )
+        what, hint = "the capture has no wavelengths to choose from", "leave wavelength out"
+        raise FitError(what, where="next_views: apart", hint=hint)
     axes = data.shape[-2:] if by_wavelength else data.shape[-1:]
     is_predicted = "intensity" in problem.program.observed
 
@@ -323,11 +305,7 @@ def _with_predicted_brightness(
 
 
 def _assemble(
-    capture: xr.Dataset,
-    views: CandidateViews,
-    design: Design,
-    selection: Selection,
-    names: list[str],
+    views: CandidateViews, design: Design, selection: Selection, names: list[str]
 ) -> xr.Dataset:
     picks = np.array(selection.picks)
     added = np.cumsum(design.each[:, picks], axis=1)
@@ -339,14 +317,15 @@ def _assemble(
             "candidate": ("pick", at),
             "criterion": ("step", selection.losses),
             "expected_sd": (("step", "parameter"), np.sqrt(variance)),
-            "interval_width": (("step", "parameter"), WIDTH * np.sqrt(variance)),
+            # A normal distribution's 95% interval.
+            "interval_width": (("step", "parameter"), 2.0 * 1.959963984540054 * np.sqrt(variance)),
         },
         coords={"parameter": names, "step": np.arange(len(picks) + 1)},
     )
     for column, name in enumerate(ANGLES):
         found[name] = ("pick", views.directions[at, column], {"units": "degree"})
     if (design.wavelength >= 0).any():
-        wavelengths = capture["wavelength"].to_numpy()[design.wavelength[picks]]
+        wavelengths = views.capture["wavelength"].to_numpy()[design.wavelength[picks]]
         found["wavelength"] = ("pick", wavelengths, {"units": "nm"})
     if (design.reading != "").any():
         found["reading"] = ("pick", design.reading[picks])
@@ -354,10 +333,6 @@ def _assemble(
 
 
 # --- Table and sentences --------------------------------------------------------------------------
-
-
-SMALL_GAIN = 0.9
-"""Width after over width before above which views hardly help."""
 
 
 def next_views_table(found: xr.Dataset) -> pd.DataFrame:
@@ -372,7 +347,7 @@ def next_views_sentences(found: xr.Dataset) -> list[str]:
     widths = found["interval_width"].transpose("step", "parameter")
     before, after = widths.isel(step=0).to_numpy(), widths.isel(step=-1).to_numpy()
     names = found["parameter"].to_numpy()
-    helped = after < SMALL_GAIN * before
+    helped = after < 0.9 * before
     sentences = [f"Look next at {'; then at '.join(_view_texts(found))}."]
     sentences += [
         f"The 95% interval of {name} is expected to narrow from {old:.3g} to {new:.3g}."

@@ -15,11 +15,8 @@ from jaxtyping import Bool, Float
 
 from polar_bayes.errors import FitError
 
-MIN_VARIANCE = 1e-14
-"""Variances below it, in squared prior sds, are rounding: one parameter follows from others."""
-
-MIN_GAIN = 1e-9
-"""Smallest relative gain for which an exchange is made: smaller ones are rounding."""
+Covariance = Float[np.ndarray, "... parameter parameter"]
+Losses = Float[np.ndarray, "..."]
 
 # --- Criteria -------------------------------------------------------------------------------------
 
@@ -29,9 +26,7 @@ class AbstractCriterion(abc.ABC):
     """One number for an expected covariance: the smaller, the better."""
 
     @abc.abstractmethod
-    def loss(
-        self, covariance: Float[np.ndarray, "... parameter parameter"], parameters: Sequence[str]
-    ) -> Float[np.ndarray, "..."]:
+    def loss(self, covariance: Covariance, parameters: Sequence[str]) -> Losses:
         """The number that a choice of views makes small.
 
         Args:
@@ -57,11 +52,10 @@ class DOptimal(AbstractCriterion):
     """
 
     @override
-    def loss(
-        self, covariance: Float[np.ndarray, "... parameter parameter"], parameters: Sequence[str]
-    ) -> Float[np.ndarray, "..."]:
+    def loss(self, covariance: Covariance, parameters: Sequence[str]) -> Losses:
         values = np.linalg.eigvalsh(covariance)
-        return 0.5 * np.sum(np.log(np.maximum(values, MIN_VARIANCE)), axis=-1)
+        # Smaller variances are rounding, in squared prior sds: one parameter follows from others.
+        return 0.5 * np.sum(np.log(np.maximum(values, 1e-14)), axis=-1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,9 +67,7 @@ class AOptimal(AbstractCriterion):
     """
 
     @override
-    def loss(
-        self, covariance: Float[np.ndarray, "... parameter parameter"], parameters: Sequence[str]
-    ) -> Float[np.ndarray, "..."]:
+    def loss(self, covariance: Covariance, parameters: Sequence[str]) -> Losses:
         return np.trace(covariance, axis1=-2, axis2=-1)
 
 
@@ -91,18 +83,13 @@ class SingleParameter(AbstractCriterion):
     name: str
 
     @override
-    def loss(
-        self, covariance: Float[np.ndarray, "... parameter parameter"], parameters: Sequence[str]
-    ) -> Float[np.ndarray, "..."]:
-        rows = [
-            i for i, label in enumerate(parameters) if self.name in (label, label.split("[")[0])
-        ]
+    def loss(self, covariance: Covariance, parameters: Sequence[str]) -> Losses:
+        names = [(label, label.split("[")[0]) for label in parameters]
+        rows = [i for i, known in enumerate(names) if self.name in known]
         if not rows:
-            raise FitError(
-                "no parameter of the material has that name",
-                where=f"SingleParameter({self.name!r})",
-                hint=f"give one of {', '.join(parameters)}",
-            )
+            what, hint = "no parameter of the material has that name", ", ".join(parameters)
+            where = f"SingleParameter({self.name!r})"
+            raise FitError(what, where=where, hint=f"give one of {hint}")
         return np.sum(np.diagonal(covariance, axis1=-2, axis2=-1)[..., rows], axis=-1)
 
 
@@ -137,11 +124,9 @@ def fedorov_exchange(
     picks: list[int] = []
     for number in range(count):
         if not (options := free(picks)):
-            raise FitError(
-                f"only {number} of {len(allowed)} candidates can be taken together",
-                where="next_views",
-                hint="ask for fewer, or give more candidates or wider constraints",
-            )
+            what = f"only {number} of {len(allowed)} candidates can be taken together"
+            hint = "ask for fewer, or give more candidates or wider constraints"
+            raise FitError(what, where="next_views", hint=hint)
         pick, reached = best(picks, options)
         picks.append(pick)
     exchanges, before = 0, -1
@@ -150,7 +135,7 @@ def fedorov_exchange(
         for at in range(count):
             others = picks[:at] + picks[at + 1 :]
             pick, lower = best(others, free(others))
-            if lower < reached - MIN_GAIN * max(1.0, abs(reached)):
+            if lower < reached - 1e-9 * max(1.0, abs(reached)):  # smaller gains are rounding
                 picks[at], reached, exchanges = pick, lower, exchanges + 1
     ordered: list[int] = []
     losses = [float(loss(base[:, None])[0])]

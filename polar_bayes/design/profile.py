@@ -5,7 +5,7 @@ At every value of the coordinate $z_i$ of a parameter all others are optimized,
 $$ \max_{z_{-i}} [\log L(z) + w \log \pi(z)] $$
 
 by numerical continuation: BFGS starts where the value before ended, in one compiled potential for
-all grids. $w = 1$ gives the profile of the posterior, $w$ = `PRIOR_WEIGHT` that of the likelihood:
+all grids. $w = 1$ gives the profile of the posterior, $w = 0.001$ that of the likelihood:
 a thousandth of the prior keeps coordinates that the data do not determine from diverging. The
 priors of the instrument's parameters belong to $L$ in both: a calibration determines them, and
 without it they trade for one another.
@@ -51,10 +51,7 @@ from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress, with_progress
 
-PRIOR_WEIGHT = 1e-3
-"""Share of the log prior that stays in the profile of the likelihood."""
-
-KINDS = {"posterior": 1.0, "likelihood": PRIOR_WEIGHT}
+KINDS = {"posterior": 1.0, "likelihood": 1e-3}
 """The weight of the log prior in either kind of profile."""
 
 
@@ -139,18 +136,13 @@ def profile(
 
 def _find_coordinate(problem: DesignProblem, parameter: str) -> Coordinate:
     """The coordinate of a scalar parameter that is sampled."""
-    known = [
-        each
-        for each in label_coordinates(problem.program, problem.request.capture)
-        if each.is_entry and each.site not in problem.program.auxiliary
-    ]
+    program, every = problem.program, label_coordinates(problem.program, problem.request.capture)
+    known = [each for each in every if each.is_entry and each.site not in program.auxiliary]
     found = [each for each in known if parameter in (each.label, each.site)]
     if len(found) != 1:
-        raise FitError(
-            f"it has {len(found)} values" if found else "no sampled parameter has that name",
-            where=f"parameter={parameter!r}",
-            hint=f"give one of {', '.join(each.label for each in (found or known)[:12])}",
-        )
+        what = f"it has {len(found)} values" if found else "no sampled parameter has that name"
+        hint = f"give one of {', '.join(each.label for each in (found or known)[:12])}"
+        raise FitError(what, where=f"parameter={parameter!r}", hint=hint)
     return found[0]
 
 
@@ -168,11 +160,8 @@ def _unconstrained(
         inside = np.isfinite(value) and bool(np.all(support(jnp.asarray(site))))
         z = float(np.ravel(dist.biject_to(support).inv(jnp.asarray(site)))[entry])
         if not inside or not np.isfinite(z):
-            raise FitError(
-                f"{value:g} is not inside its prior",
-                where=f"profile: values of {coordinate.label}",
-                hint="leave it out",
-            )
+            what, where = f"{value:g} is not inside its prior", f"values of {coordinate.label}"
+            raise FitError(what, where=f"profile: {where}", hint="leave it out")
         found.append(z)
     if not found:
         raise FitError("there are no values", where="profile: values", hint="give at least one")
@@ -215,10 +204,7 @@ def _assemble(problem: DesignProblem, coordinate: Coordinate, curve: "ProfileCur
             "parameter": labels,
             "side": ["below", "above"],
         },
-        attrs={
-            "parameter": coordinate.label,
-            **provenance_attrs(problem.request),
-        },
+        attrs={"parameter": coordinate.label, **provenance_attrs(problem.request)},
     )
 
 
@@ -256,16 +242,6 @@ def _weighted_potential(compiled_model: CompiledModel, known: frozenset[str]) ->
 # --- Numerical continuation of the conditional modes ----------------------------------------------
 
 
-MAX_GRADIENT = 0.03
-"""Largest gradient left, per posterior sd: a profile is then within half its square of its mode."""
-
-SETTLED_GRADIENT = 1e-5
-"""The same at which a search ends."""
-
-MAX_MODES = 3
-"""Modes from which a profile is followed, at most; the best of them counts."""
-
-
 class ProfileCurve(NamedTuple):
     """Profiles by kind on one grid of the coordinate, and their arguments; NaN where none ended."""
 
@@ -277,21 +253,21 @@ class ProfileCurve(NamedTuple):
 def _trace_profile(
     index: int, modes: Modes, potentials: Sequence[ValueAndGradient], grid: np.ndarray
 ) -> ProfileCurve:
-    """Follow both kinds from every mode to both ends of the grid, and keep the best."""
+    """Follow both kinds from the first three modes to both ends of the grid, and keep the best."""
     slope, factor = conditional_normal(modes.covariance[0], index)
     value = np.full((len(potentials), grid.size), np.nan)
     best = np.full((len(potentials), grid.size, slope.size), np.nan)
     center = modes.z[0, index]
     sides = np.flatnonzero(grid <= center)[::-1], np.flatnonzero(grid > center)
     with ignore_line_search_warnings():
-        for start, side in itertools.product(modes.z[:MAX_MODES], sides):
+        for start, side in itertools.product(modes.z[:3], sides):
             last = [start] * len(potentials)
             for point in side:
                 guesses = [z + slope * (grid[point] - z[index]) for z in last]
                 for kind, potential in enumerate(map(finite_potential, potentials)):
                     # The likelihood starts at the posterior's mode where that is better.
                     near = min([guesses[kind], *last[:kind]], key=lambda z: potential(z)[0])
-                    z, _ = conditional_mode(potential, near, factor, gtol=SETTLED_GRADIENT)
+                    z, _ = conditional_mode(potential, near, factor, gtol=1e-5)
                     last[kind] = z
                     height = _log_density_at(potentials[kind], z, factor)
                     if height > np.nan_to_num(value[kind, point], nan=-np.inf):
@@ -304,18 +280,12 @@ def _log_density_at(potential: ValueAndGradient, z: np.ndarray, factor: np.ndarr
     if not np.isfinite(z).all():
         return np.nan
     loss, gradient = potential(z)
-    converged = np.linalg.norm(factor.T @ gradient) < MAX_GRADIENT
+    # The gradient left, per posterior sd: a profile is within half its square of its mode.
+    converged = np.linalg.norm(factor.T @ gradient) < 0.03
     return -loss if converged and np.isfinite(loss) else np.nan
 
 
 # --- Grid and interval ----------------------------------------------------------------------------
-
-
-DROP = 1.92
-"""Half the 95% quantile of chi squared with one degree of freedom."""
-
-GRID_SDS = 4.0
-"""Half-width of the first grid, in posterior sds of the coordinate."""
 
 
 def _on_default_grid(
@@ -327,7 +297,7 @@ def _on_default_grid(
 ) -> ProfileCurve:
     """Profiles four sds to either side, or over almost all of the prior where they stay open."""
     center = modes.z[0, index]
-    reach = GRID_SDS * float(np.sqrt(modes.covariance[0][index, index]))
+    reach = 4.0 * float(np.sqrt(modes.covariance[0][index, index]))
     half = points // 2
 
     def grid(low: float, high: float) -> np.ndarray:
@@ -348,8 +318,9 @@ def likelihood_interval(theta: np.ndarray, value: np.ndarray) -> tuple[float, fl
     known = np.flatnonzero(np.isfinite(value))
     if known.size == 0:
         return np.nan, np.nan, True, True
+    most = 1.92  # half the 95% quantile of chi squared with one degree of freedom
     drop = np.nanmax(value) - value
-    inside = known[drop[known] < DROP]
+    inside = known[drop[known] < most]
 
     def end(at: int, beyond: np.ndarray) -> tuple[float, bool]:
         """The interpolated end next to the last point inside; `beyond`: points outside of it."""
@@ -358,7 +329,7 @@ def likelihood_interval(theta: np.ndarray, value: np.ndarray) -> tuple[float, fl
         other = beyond[np.argmin(np.abs(beyond - at))]
         if abs(other - at) > 1:  # points between them did not converge
             return float(theta[other]), False
-        share = (DROP - drop[at]) / (drop[other] - drop[at])
+        share = (most - drop[at]) / (drop[other] - drop[at])
         return float(theta[at] + share * (theta[other] - theta[at])), False
 
     first, last = int(inside[0]), int(inside[-1])
@@ -368,10 +339,6 @@ def likelihood_interval(theta: np.ndarray, value: np.ndarray) -> tuple[float, fl
 
 
 # --- Table and sentences --------------------------------------------------------------------------
-
-
-SMALL_SHARE = 0.02
-"""Share of the prior beyond the grid below which the grid counts as all of it."""
 
 
 def profile_table(found: xr.Dataset) -> pd.DataFrame:
@@ -404,7 +371,7 @@ def _interval_sentence(name: str, row: xr.Dataset) -> str:
     ends = []
     for side, end in flat.items():
         way = "down" if side == "below" else "up"
-        covers_prior = float(row["prior_beyond"].sel(side=side)) <= SMALL_SHARE
+        covers_prior = float(row["prior_beyond"].sel(side=side)) <= 0.02
         reach = f", {way} to {end:.4g}" if covers_prior else f" as far as the grid goes ({end:.4g})"
         ends.append(f"nothing {side}{reach}")
     if len(ends) == 2:

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -42,7 +42,7 @@ class DesignProblem(NamedTuple):
         return self.compiled_model.program
 
 
-def provenance_attrs(request: Request, **more: Any) -> dict[str, str]:
+def provenance_attrs(request: Request, **more: object) -> dict[str, str]:
     """The attribute of a result that holds its capture, model and settings, as JSON."""
     capture = str(request.capture.attrs.get("name", "capture"))
     found = {**request.describe(), "capture": capture, **more}
@@ -106,35 +106,34 @@ def label_parameters(problem: DesignProblem) -> ParameterLabels:
 # --- Draws of the posterior, over which the criterion of a design is averaged ---------------------
 
 
-LAPLACE_FOLD = 7
-"""Folded into the key of the seed, which the draws from the prior use itself."""
-
-
-def laplace_draws(modes: Modes, count: int, seed: int) -> Float[np.ndarray, "draw size"]:
-    """Draws of the Laplace approximation at the heaviest mode."""
-    key = jax.random.fold_in(jax.random.key(seed), LAPLACE_FOLD)
+def posterior_draws(
+    problem: DesignProblem, result: xr.DataTree | None, count: int, progress: Progress | None
+) -> Float[np.ndarray, "draw size"]:
+    """Draws of a fit, or else of the Laplace approximation at the heaviest mode."""
+    if result is not None:
+        return _fit_draws(problem, result, count)
+    modes = posterior_modes(problem, progress)
+    # Another key than that of the draws from the prior.
+    key = jax.random.fold_in(jax.random.key(problem.request.seed), 7)
     noise = np.asarray(jax.random.normal(key, (count, modes.z.shape[1])))
     return modes.z[0] + noise @ np.linalg.cholesky(modes.covariance[0]).T
 
 
-def fit_draws(
+def _fit_draws(
     problem: DesignProblem, result: xr.DataTree, count: int
 ) -> Float[np.ndarray, "draw size"]:
     """Finite draws of a fit, evenly spaced, as unconstrained vectors."""
-    where = "next_views: result"
+    where, program = "next_views: result", problem.program
     check_fit(result, where)
-    program = problem.program
     template = program.constrain(jnp.zeros(program.size))
     groups = [result.get(name) for name in ("posterior", "unconstrained_posterior")]
     sites = {}
     for name in program.supports:
         group = next((g for g in groups if g is not None and name in g.data_vars), None)
         if group is None or group[name].size % template[name].size or group[name].ndim < 2:
-            raise FitError(
-                f"it has no draws of {name} as this model has it",
-                where=where,
-                hint="give a fit of the same capture, model, scene and links",
-            )
+            hint = "give a fit of the same capture, model, scene and links"
+            what = f"it has no draws of {name} as this model has it"
+            raise FitError(what, where=where, hint=hint)
         values = group[name].transpose("chain", "draw", ...).to_numpy()
         sites[name] = values.reshape(-1, *template[name].shape)
     number = min(len(x) for x in sites.values())
@@ -160,10 +159,8 @@ def coordinate_indices(program: Program, extended: Program) -> Int[np.ndarray, "
     indices = np.zeros(program.size, int)
     for name, position in program.positions.items():
         if name not in theirs or theirs[name].shape != position.shape:
-            raise FitError(
-                f"{name} belongs to single views, and no reading of a new view determines it yet",
-                where="next_views: model",
-                hint="use a model whose parameters do not belong to single views",
-            )
+            what = f"{name} belongs to single views, and no reading of a new view determines it yet"
+            hint = "use a model whose parameters do not belong to single views"
+            raise FitError(what, where="next_views: model", hint=hint)
         indices[position] = theirs[name]
     return indices

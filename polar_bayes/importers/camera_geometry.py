@@ -11,7 +11,7 @@ $$ a = x - \frac{v_x}{1 + v_z} (z + v), \qquad b = v \times a $$
 
 import abc
 import dataclasses
-from typing import Any, override
+from typing import override
 
 import numpy as np
 
@@ -23,8 +23,6 @@ ON_NORMAL = 1e-6
 
 EDGE_ON = 1e-9
 """Cosine below which a surface no longer faces something; its zenith stays below 90 degrees."""
-
-COMPONENT = Interval(-1e9, 1e9)
 
 
 class AbstractLocation(abc.ABC):
@@ -60,7 +58,8 @@ class Direction(AbstractLocation):
     z: float
 
     def __post_init__(self) -> None:
-        if not any(_check_components(self)):
+        _check_components(self)
+        if not any(dataclasses.astuple(self)):
             hint = "give a vector that is not zero"
             raise CaptureError("it points nowhere", where=repr(self), hint=hint)
 
@@ -117,8 +116,7 @@ class Highlight:
     column: float
 
     def __post_init__(self) -> None:
-        Interval(0.0, 1e6).check(self.row, "Highlight: row")
-        Interval(0.0, 1e6).check(self.column, "Highlight: column")
+        Interval(0.0, 1e6).check_fields(self, "row", "column")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,10 +158,10 @@ def local_geometry(normals: np.ndarray, view: np.ndarray, light: np.ndarray) -> 
     upright, from_above = sin_view < ON_NORMAL, sin_light < ON_NORMAL
     # On the normal the frame is the light's, as if the viewer were opposite to it; where both are
     # on the normal, any frame will do.
-    fallback = np.where(from_above[..., None], _first_axis(view), -across_light)
+    first = _first_axis(view)
+    fallback = np.where(from_above[..., None], first, -across_light)
     s_axis = np.where(upright[..., None], fallback, across_view)
     s_axis = s_axis / np.linalg.norm(s_axis, axis=-1, keepdims=True)
-    first = _first_axis(view)
     cos, sin = _dot(s_axis, first), _dot(s_axis, np.cross(view, first))
     length = np.hypot(cos, sin)
     cos, sin = cos / length, sin / length
@@ -189,7 +187,7 @@ def mirror_direction(normals: np.ndarray, view: np.ndarray) -> np.ndarray:
     return 2.0 * _dot(normals, view)[..., None] * normals - view
 
 
-def as_location(location: Any, where: str) -> AbstractLocation:
+def as_location(location: object, where: str) -> AbstractLocation:
     """A location from a user's argument."""
     if isinstance(location, AbstractLocation):
         return location
@@ -209,7 +207,5 @@ def _dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.sum(first * second, axis=-1)
 
 
-def _check_components(location: Direction | Position) -> list[float]:
-    """The components, each of which must be a number."""
-    name = type(location).__name__
-    return [COMPONENT.check(getattr(location, k), f"{name}: {k}") for k in ("x", "y", "z")]
+def _check_components(location: Direction | Position) -> None:
+    Interval(-1e9, 1e9).check_fields(location, "x", "y", "z")

@@ -19,7 +19,6 @@ import os
 import warnings
 from collections.abc import Sequence
 from numbers import Real
-from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -32,14 +31,8 @@ from polar_bayes.paths import existing_file
 
 Frame = str | os.PathLike[str] | np.ndarray
 
-FORMATS = ("PNG", "TIFF")
-"""Of image files, those that keep counts as they are."""
 
-GRAY_MODES = ("L", "I;16", "I;16L", "I;16B", "I", "F")
-LARGEST_COUNT = 1e9
-
-
-def read_frame(frame: Any, where: str) -> tuple[np.ndarray, float | None]:
+def read_frame(frame: object, where: str) -> tuple[np.ndarray, float | None]:
     """One frame of gray values, and the count of a full pixel where the format states it."""
     values = read_image(frame, where)
     where = str(frame) if isinstance(frame, str | os.PathLike) else where
@@ -48,10 +41,10 @@ def read_frame(frame: Any, where: str) -> tuple[np.ndarray, float | None]:
         hint = "give rows and columns of numbers; of a color frame, one channel"
         raise CaptureError(what, where=where, hint=hint)
     counts = values.astype(np.float64)
-    if not np.isfinite(counts).all() or np.abs(counts).max() > LARGEST_COUNT:
-        row, column = np.argwhere(~(np.abs(counts) <= LARGEST_COUNT))[0]
-        what = f"{counts[row, column]:g} is no reading"
-        hint = f"give finite counts up to {LARGEST_COUNT:g}"
+    is_reading = np.abs(counts) <= 1e9
+    if not is_reading.all():
+        row, column = np.argwhere(~is_reading)[0]
+        what, hint = f"{counts[row, column]:g} is no reading", "give finite counts up to 1e+09"
         raise CaptureError(what, where=f"{where}[row={row}, column={column}]", hint=hint)
     return counts, 255.0 if values.dtype == np.uint8 else None
 
@@ -76,19 +69,20 @@ def read_array(path: str | os.PathLike[str], where: str) -> np.ndarray:
     return np.array(mapped)
 
 
-def read_image(frame: Any, where: str) -> np.ndarray:
+def read_image(frame: object, where: str) -> np.ndarray:
     """The values of one channel of an image file, or of an array as it is."""
     if not isinstance(frame, str | os.PathLike):
         return np.asarray(frame)
-    file = existing_file(frame, where)
+    file, gray = existing_file(frame, where), ("L", "I;16", "I;16L", "I;16B", "I", "F")
     if file.suffix == ".npy":
         return read_array(file, where)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(file, formats=FORMATS) as image:
+            # These formats keep counts as they are.
+            with Image.open(file, formats=("PNG", "TIFF")) as image:
                 mode, pages = image.mode, getattr(image, "n_frames", 1)
-                values = np.asarray(image) if mode in GRAY_MODES and pages == 1 else None
+                values = np.asarray(image) if mode in gray and pages == 1 else None
     except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
         hint = "cut it to what matters, or give it as .npy"
         raise CaptureError("it is larger than any camera", where=str(file), hint=hint) from error
@@ -97,7 +91,7 @@ def read_image(frame: Any, where: str) -> np.ndarray:
         raise CaptureError("it cannot be read as an image", where=str(file), hint=hint) from error
     if values is not None:
         return values
-    if mode not in GRAY_MODES:
+    if mode not in gray:
         hint = "save it with 8 or 16 bits of gray, or give one channel as .npy"
         raise CaptureError(f"its pixels are {mode}, not gray values", where=str(file), hint=hint)
     hint = "save each page as a file of its own"
@@ -105,14 +99,6 @@ def read_image(frame: Any, where: str) -> np.ndarray:
 
 
 # --- Correction and noise -------------------------------------------------------------------------
-
-FULL_WELL = 10_000.0
-"""Electrons that fill a pixel of a machine-vision sensor, where the gain is not stated."""
-
-ROUNDING = 1.0 / 12.0
-DARKEST_FLAT = 0.05
-
-POSITIVE = Interval(0.0, 1e9, open_low=True)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -145,7 +131,7 @@ class Detector:
     def __post_init__(self) -> None:
         for name in ("saturation_level", "gain"):
             if getattr(self, name) is not None:
-                POSITIVE.check(getattr(self, name), name)
+                Interval(0.0, 1e9, open_low=True).check(getattr(self, name), name)
         Interval(0.0, 1e9).check(self.read_noise, "read_noise")
         Interval(0.0, 1.0, open_high=True).check(self.relative_error, "relative_error")
 
@@ -169,18 +155,19 @@ def signal_of(frames: Sequence[np.ndarray], level: float | None, detector: Detec
         hint = "give it: 4095 for 12 bits, 65535 for 16 bits"
         raise CaptureError(what, where="saturation_level", hint=hint)
     raw = np.stack(frames)
-    shape = raw.shape[1:]
-    if isinstance(detector.dark, Real):
-        dark = np.full(shape, Interval(-1e9, 1e9).check(detector.dark, "dark"))
+    shape, dark = raw.shape[1:], detector.dark
+    if isinstance(dark, Real):
+        dark = np.full(shape, Interval(-1e9, 1e9).check(dark, "dark"))
     else:
-        dark = _calibration_frame(detector.dark, shape, "dark")
+        dark = _calibration_frame(dark, shape, "dark")
     flat = _flat(detector.flat, shape)
     if not (dark < full).all():
         hint = "check it and the saturation level"
         raise CaptureError(f"it reaches the full count {full:g}", where="dark", hint=hint)
-    gain = full / FULL_WELL if detector.gain is None else float(detector.gain)
+    # Electrons that fill a pixel of a machine-vision sensor.
+    gain = full / 10_000.0 if detector.gain is None else float(detector.gain)
     counts = raw - dark
-    variance = detector.read_noise**2 + ROUNDING + gain * np.maximum(counts, 0.0)
+    variance = detector.read_noise**2 + 1.0 / 12.0 + gain * np.maximum(counts, 0.0)
     return Signal(
         light=counts / flat,
         variance=variance / flat**2,
@@ -204,7 +191,7 @@ def _flat(flat: Frame | None, shape: tuple[int, ...]) -> np.ndarray:
         return np.ones(shape)
     values = _calibration_frame(flat, shape, "flat")
     mean = float(values.mean())
-    if not mean > 0.0 or not (values > DARKEST_FLAT * mean).all():
+    if not mean > 0.0 or not (values > 0.05 * mean).all():
         row, column = np.unravel_index(np.argmin(values), shape)
         what = f"{values[row, column]:g} is less than a twentieth of its mean {mean:g}"
         hint = "subtract its dark frame, use even light, and correct dead pixels"
@@ -212,7 +199,7 @@ def _flat(flat: Frame | None, shape: tuple[int, ...]) -> np.ndarray:
     return values / mean
 
 
-def _calibration_frame(frame: Frame | float, shape: tuple[int, ...], where: str) -> np.ndarray:
+def _calibration_frame(frame: object, shape: tuple[int, ...], where: str) -> np.ndarray:
     values, _ = read_frame(frame, where)
     if values.shape != shape:
         what = f"it is {values.shape}, the frames are {shape}"
@@ -230,6 +217,6 @@ def _source(frame: Frame | float | None) -> str | float:
     return "array" if isinstance(frame, np.ndarray) else os_name(frame)
 
 
-def os_name(path: Any) -> str:
+def os_name(path: object) -> str:
     """The last part of a path: what was read, without the folders of this machine."""
     return str(path).replace("\\", "/").rstrip("/").split("/")[-1]

@@ -27,7 +27,6 @@ import math
 import os
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -40,15 +39,8 @@ from polar_bayes.importers.table import Table, read_table
 
 Readings = str | os.PathLike[str] | tuple[ArrayLike, ArrayLike]
 
-ANGLE_DECIMALS = 6  # angles that agree to this many decimals are one angle
-MOST_ERRORS_BELOW_DARK = 3.0  # a reading so far below the dark level is still no light
-LARGEST_REFLECTANCE = 1.2  # noise may carry a reflectance past one, not this far
-SMALLEST_ERROR = 1e-30
-SMALLEST_COMPARED_ZENITH = 10.0  # s and p differ too little nearer to the normal
-SWAPPED_ERRORS, SWAPPED_VIEWS, SWAPPED_SHARE = 2.0, 3, 0.9
-LARGEST_READING = 1e30
+SMALLEST_ERROR, LARGEST_READING = 1e-30, 1e30
 LEVEL = Interval(-LARGEST_READING, LARGEST_READING, open_low=True, open_high=True)
-ERROR = Interval(SMALLEST_ERROR, LARGEST_READING, open_high=True)
 
 
 def from_goniometer(
@@ -99,11 +91,12 @@ def from_goniometer(
         hint = "give s_incident and p_incident, or neither"
         raise CaptureError("one incident level is missing", where="goniometer", hint=hint)
     above_dark = dataclasses.replace(LEVEL, low=dark_level)
+    errors = Interval(SMALLEST_ERROR, LARGEST_READING, open_high=True)
     optional = (
         ("s_incident", s_incident, above_dark),
         ("p_incident", p_incident, above_dark),
-        ("s_error", s_error, ERROR),
-        ("p_error", p_error, ERROR),
+        ("s_error", s_error, errors),
+        ("p_error", p_error, errors),
     )
     given = {key: limits.check(x, key) for key, x, limits in optional if x is not None}
     s_channel, p_channel, sources = _channels(s, p, table, angle)
@@ -129,10 +122,11 @@ def from_goniometer(
 
 def _refuse_swapped(capture: xr.Dataset) -> None:
     """Refuse s and p where s lies below p at nearly every angle, Brewster's included."""
-    q, limit = capture["q"], SWAPPED_ERRORS * capture["q_error"]
-    compared = capture["valid"] & (capture["view_zenith"] >= SMALLEST_COMPARED_ZENITH)
+    q, limit = capture["q"], 2.0 * capture["q_error"]
+    # Nearer to the normal s and p differ too little.
+    compared = capture["valid"] & (capture["view_zenith"] >= 10.0)
     below, total = int((compared & (q < -limit)).sum()), int(compared.sum())
-    if total >= SWAPPED_VIEWS and below >= SWAPPED_SHARE * total:
+    if total >= 3 and below >= 0.9 * total:
         what = f"s lies below p at {below} of {total} angles, which no reflecting surface does"
         hint = (
             "swap s and p, or give s_incident and p_incident where the channels differ in gain; a "
@@ -142,7 +136,7 @@ def _refuse_swapped(capture: xr.Dataset) -> None:
 
 
 def _channels(
-    s: Any, p: Any, table: str | os.PathLike[str] | None, angle: str | None
+    s: Readings | None, p: Readings | None, table: str | os.PathLike[str] | None, angle: str | None
 ) -> tuple["Channel", "Channel", list[Path]]:
     """Both channels, and the files that they come from."""
     if table is None:
@@ -158,10 +152,11 @@ def _channels(
         if not isinstance(column, str):
             hint = f"give {key}= the name of a column of the table"
             raise CaptureError("its column is not named", where=f"{table}: {key}", hint=hint)
-    columns = read_table(table, [str(angle), s, p])
+    angle, s, p = str(angle), str(s), str(p)
+    columns = read_table(table, [angle, s, p])
     return (
-        _channel_of_table("s", columns, str(angle), s),
-        _channel_of_table("p", columns, str(angle), p),
+        _channel_of_table("s", columns, angle, s),
+        _channel_of_table("p", columns, angle, p),
         [Path(table)],
     )
 
@@ -223,20 +218,17 @@ class Channel:
         """The light above the dark level, over the incident light where that is known."""
         errors = self.error if error is None else np.full_like(self.error, error)
         light = self.light - dark_level
-        self.refuse(
-            light < -MOST_ERRORS_BELOW_DARK * errors,
-            f"the reading lies below the dark level {dark_level:g}",
-            f"give the right dark_level, or the noise without light as {self.name}_error",
-        )
+        what = f"the reading lies below the dark level {dark_level:g}"
+        hint = f"give the right dark_level, or the noise without light as {self.name}_error"
+        self.refuse(light < -3.0 * errors, what, hint)
         light = np.maximum(light, 0.0)
         full = 1.0
         if incident is not None:
             full = incident - dark_level
-            self.refuse(
-                light > LARGEST_REFLECTANCE * full,
-                "more light comes back than went in",
-                f"check the incident levels: {self.name}_incident is {incident:g}",
-            )
+            what = "more light comes back than went in"
+            hint = f"check the incident levels: {self.name}_incident is {incident:g}"
+            # Noise may carry a reflectance past one, not this far.
+            self.refuse(light > 1.2 * full, what, hint)
         return dataclasses.replace(self, light=light / full, error=errors / full)
 
     def at(
@@ -269,7 +261,7 @@ def _interpolation_error(angle: np.ndarray, logs: np.ndarray) -> np.ndarray:
     return np.fmax(residual[:-1], residual[1:]) / 4.0
 
 
-def _channel(name: str, readings: Any) -> Channel:
+def _channel(name: str, readings: Readings) -> Channel:
     """A channel from a table of two columns, or from a pair of arrays."""
     if isinstance(readings, str | os.PathLike):
         table = read_table(readings)
@@ -306,31 +298,18 @@ def _channel_of_table(name: str, table: Table, angle: str, reading: str) -> Chan
 def _sorted(
     name: str, angle: np.ndarray, reading: np.ndarray, step: np.ndarray, sources: list[str]
 ) -> Channel:
-    angle = np.round(angle.astype(np.float64), ANGLE_DECIMALS)
+    angle = np.round(angle.astype(np.float64), 6)  # angles that agree so far are one
     order = np.argsort(angle, kind="stable")
     resolution = np.maximum(step / math.sqrt(12.0), SMALLEST_ERROR)
-    channel = Channel(
-        name,
-        angle[order],
-        reading.astype(np.float64)[order],
-        resolution[order],
-        tuple(sources[k] for k in order),
-    )
-    channel.refuse(
-        ~ZENITH.contains(channel.angle),
-        f"the angle is outside {ZENITH}",
-        "give degrees from the surface normal",
-    )
-    channel.refuse(
-        np.diff(channel.angle, prepend=-1.0) == 0.0,
-        f"{name} was read at this angle before",
-        "average the repeats or keep one",
-    )
-    channel.refuse(
-        np.abs(channel.light) >= LARGEST_READING,
-        "the reading is too large",
-        f"give readings below {LARGEST_READING:g}",
-    )
+    columns = angle[order], reading.astype(np.float64)[order], resolution[order]
+    channel = Channel(name, *columns, tuple(sources[k] for k in order))
+    is_outside, is_repeated = ~ZENITH.contains(columns[0]), np.diff(columns[0], prepend=-1.0) == 0.0
+    what, hint = f"the angle is outside {ZENITH}", "give degrees from the surface normal"
+    channel.refuse(is_outside, what, hint)
+    what, hint = f"{name} was read at this angle before", "average the repeats or keep one"
+    channel.refuse(is_repeated, what, hint)
+    what, hint = "the reading is too large", f"give readings below {LARGEST_READING:g}"
+    channel.refuse(np.abs(columns[1]) >= LARGEST_READING, what, hint)
     return channel
 
 

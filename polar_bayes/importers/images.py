@@ -29,7 +29,6 @@ import importlib.metadata
 from collections.abc import Sequence
 from numbers import Integral
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -49,7 +48,7 @@ from polar_bayes.importers.camera_geometry import (
     mirror_direction,
 )
 from polar_bayes.importers.detector import Detector, Frame, Signal, os_name, read_frame, signal_of
-from polar_bayes.importers.normals import AbstractShape, Sphere, as_shape
+from polar_bayes.importers.normals import AbstractShape, ShapeLike, as_shape
 from polar_bayes.importers.stokes import StokesImage, check_angles, fit_stokes, unbiased_dop
 
 # --- Binning --------------------------------------------------------------------------------------
@@ -69,12 +68,9 @@ class Binning:
                 hint = "give a whole number of 1 or more"
                 raise CaptureError(f"it is {value!r}", where=name, hint=hint)
         if min(self.shape) < 1:
-            raise CaptureError(
-                f"frames of {self.frame[0]} rows and {self.frame[1]} columns hold no square of "
-                f"{self.width} pixels",
-                where="bin, window",
-                hint="give smaller ones",
-            )
+            frames = f"frames of {self.frame[0]} rows and {self.frame[1]} columns"
+            what = f"{frames} hold no square of {self.width} pixels"
+            raise CaptureError(what, where="bin, window", hint="give smaller ones")
 
     @property
     def width(self) -> int:
@@ -88,9 +84,8 @@ class Binning:
 
     def centers(self, width: int) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns at the centers of blocks of that width."""
-        rows, columns = (
-            np.arange(0, n * self.width, width) + 0.5 * (width - 1) for n in self.shape
-        )
+        ends = (n * self.width for n in self.shape)
+        rows, columns = (np.arange(0, end, width) + 0.5 * (width - 1) for end in ends)
         return rows, columns
 
     def blocks(self, values: np.ndarray) -> np.ndarray:
@@ -117,17 +112,12 @@ class Binning:
 # --- A capture from binned readings behind a polarizer --------------------------------------------
 
 
-DARKEST = 10.0
-"""Least intensity over its error: below it a quotient is no longer normal."""
-
 FACING = Direction(0.0, 0.0, 1.0)
 """A camera that is far away."""
 
-DIRECTIONS = ("view_zenith", "view_azimuth", "light_zenith", "light_azimuth")
-
 
 def _locate(
-    shape: Any, view: Any, light: Any, binning: Binning
+    shape: object, view: object, light: object, binning: Binning
 ) -> tuple[LocalGeometry, dict[str, str]]:
     """Directions at every reading, and the attributes that describe surface, view and light."""
     surface, view = as_shape(shape), as_location(view, "view")
@@ -177,7 +167,7 @@ def _capture(
     binning: Binning,
     geometry: LocalGeometry,
     signal: Signal,
-    attributes: dict[str, Any],
+    attributes: dict[str, str],
     wavelength: float | None,
 ) -> xr.Dataset:
     """A capture from binned light (angle, row, column), its variance, and saturated bins."""
@@ -202,14 +192,15 @@ def _capture(
         "u_error": np.sqrt(stokes.u_variance),
         "intensity_error": np.sqrt(stokes.intensity_variance),
     }
+    directions = ("view_zenith", "view_azimuth", "light_zenith", "light_azimuth")
     variables = {
-        **{name: getattr(geometry, name) for name in DIRECTIONS},
+        **{name: getattr(geometry, name) for name in directions},
         **{name: np.where(valid, values, np.nan) for name, values in readings.items()},
         "saturated": saturated,
         "valid": valid,
     }
     misfit = stokes.misfit
-    attributes |= {
+    described = attributes | {
         "setup": "picture",
         "analyzer_angles": ", ".join(f"{angle:g}" for angle in angles),
         "bin": binning.bin,
@@ -226,7 +217,7 @@ def _capture(
     capture = xr.Dataset(
         {name: (("y", "x", "view"), binning.views(x)) for name, x in variables.items()},
         {"y": rows, "x": columns},
-        attributes,
+        described,
     )
     capture["intensity"].attrs = {"units": "counts", "saturation_level": signal.full_scale}
     capture["intensity_error"].attrs = {"units": "counts"}
@@ -240,7 +231,8 @@ def _reasons_to_mask(
 ) -> dict[str, np.ndarray]:
     """The readings that cannot be used, each under its first reason."""
     with np.errstate(invalid="ignore"):
-        dark = ~(stokes.intensity > DARKEST * np.sqrt(stokes.intensity_variance))
+        # In darker light a quotient is no longer normal.
+        dark = ~(stokes.intensity > 10.0 * np.sqrt(stokes.intensity_variance))
         squared = stokes.q**2 + stokes.u**2
         largest = np.maximum(np.abs(stokes.q), np.abs(stokes.u))
         overpolarized = ~(squared <= 1.0 + EXCESS_POLARIZATION) | ~(largest <= 1.0)
@@ -259,7 +251,7 @@ def _reasons_to_mask(
     return reasons
 
 
-def _names(frames: Sequence[Frame], name: str | None, default: str) -> dict[str, Any]:
+def _names(frames: Sequence[Frame], name: str | None, default: str) -> dict[str, str]:
     """The attributes `name` and `source` of a capture."""
     files = [os_name(frame) for frame in frames if not isinstance(frame, np.ndarray)]
     stem = files[0].rsplit(".", 1)[0] if files else default
@@ -273,7 +265,7 @@ def from_polarizer(
     frames: Sequence[Frame],
     angles: ArrayLike,
     *,
-    shape: AbstractShape | Sphere | Sequence[Sphere] | Any,
+    shape: ShapeLike,
     light: AbstractLocation | Highlight | Surroundings | Sequence[float],
     view: AbstractLocation | Sequence[float] = FACING,
     detector: Detector | None = None,
@@ -351,13 +343,11 @@ SONY = ((90.0, 45.0), (135.0, 0.0))
 AT = ((1, 1), (0, 1), (0, 0), (1, 0))
 """Row and column of the pixels that polanalyser takes for 0, 45, 90 and 135 degrees."""
 
-DEEPEST = 65535.0
-
 
 def from_mosaic(
     frame: Frame,
     *,
-    shape: AbstractShape | Sphere | Sequence[Sphere] | Any,
+    shape: ShapeLike,
     light: AbstractLocation | Highlight | Surroundings | Sequence[float],
     view: AbstractLocation | Sequence[float] = FACING,
     layout: ArrayLike = SONY,
@@ -423,7 +413,7 @@ def _demosaiced(polanalyser: ModuleType, light: np.ndarray) -> np.ndarray:
     # linear, so the frame is shifted and stretched to just that range and back: dark pixels whose
     # noise lies below zero stay what they are.
     low, high = float(light.min()), float(light.max())
-    step = (high - low) / DEEPEST if high > low else 1.0
+    step = (high - low) / 65535.0 if high > low else 1.0
     whole = np.rint((light - low) / step).astype(np.uint16)
     return np.stack(polanalyser.demosaicing(whole)).astype(np.float64) * step + low
 

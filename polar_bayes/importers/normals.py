@@ -9,21 +9,16 @@ import abc
 import dataclasses
 import os
 from collections.abc import Sequence
-from typing import Any, override
+from typing import override
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from polar_bayes.capture.schema import Interval, as_numbers
 from polar_bayes.errors import CaptureError
 from polar_bayes.importers.detector import os_name, read_array
 from polar_bayes.importers.table import read_table
-
-FEWEST_RIM_POINTS = 4
-CENTER = Interval(-1e6, 1e6)
-RADIUS = Interval(1.0, 1e6)
-UNIT_LENGTH = 0.05
-"""How far the length of a normal may be from one."""
 
 
 class AbstractShape(abc.ABC):
@@ -70,8 +65,8 @@ class Sphere:
     radius: float
 
     def __post_init__(self) -> None:
-        for name, allowed in (("row", CENTER), ("column", CENTER), ("radius", RADIUS)):
-            allowed.check(getattr(self, name), f"Sphere: {name}")
+        Interval(-1e6, 1e6).check_fields(self, "row", "column")
+        Interval(1.0, 1e6).check_fields(self, "radius")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,11 +107,8 @@ class Spheres(AbstractShape):
     @override
     def check(self, shape: tuple[int, ...]) -> None:
         for sphere in self.spheres:
-            inside = (
-                -sphere.radius < sphere.row < shape[0] + sphere.radius
-                and -sphere.radius < sphere.column < shape[1] + sphere.radius
-            )
-            if not inside:
+            center, reach = (sphere.row, sphere.column), sphere.radius
+            if not all(-reach < x < size + reach for x, size in zip(center, shape, strict=True)):
                 what = f"it lies outside of frames of {shape[0]} rows and {shape[1]} columns"
                 hint = "give row, column and radius in pixels of the frame, row first"
                 raise CaptureError(what, where=repr(sphere), hint=hint)
@@ -154,7 +146,7 @@ class NormalMap(AbstractShape):
         values = values.astype(np.float64)
         length = np.linalg.norm(values, axis=-1, keepdims=True)
         missing = ~np.isfinite(length) | (length == 0.0)
-        wrong = ~missing & (np.abs(length - 1.0) > UNIT_LENGTH)
+        wrong = ~missing & (np.abs(length - 1.0) > 0.05)
         if wrong.any():
             row, column, _ = np.argwhere(wrong)[0]
             what = f"its length is {length[row, column, 0]:g}"
@@ -189,7 +181,7 @@ class NormalMap(AbstractShape):
         return f"normals: {os_name(self.values)}"
 
 
-def fit_sphere(rim: Any) -> Sphere:
+def fit_sphere(rim: ArrayLike | os.PathLike[str]) -> Sphere:
     """The outline of a sphere through points on its rim, by least squares of their distances.
 
     Args:
@@ -208,7 +200,7 @@ def fit_sphere(rim: Any) -> Sphere:
         where, points = table.source, np.stack([table.columns["row"], table.columns["column"]], -1)
     else:
         where, points = "rim", _points(rim)
-    if len(points) < FEWEST_RIM_POINTS:
+    if len(points) < 4:
         hint = "mark four points or more on the outline, all around"
         raise CaptureError(f"it has {len(points)} points", where=where, hint=hint)
     center = points.mean(axis=0)
@@ -226,7 +218,10 @@ def fit_sphere(rim: Any) -> Sphere:
     return Sphere(*found.tolist())
 
 
-def as_shape(shape: Any) -> AbstractShape:
+ShapeLike = AbstractShape | Sphere | Sequence[Sphere] | np.ndarray | str | os.PathLike[str]
+
+
+def as_shape(shape: object) -> AbstractShape:
     """A shape from a user's argument."""
     if isinstance(shape, AbstractShape):
         return shape
@@ -240,7 +235,7 @@ def as_shape(shape: Any) -> AbstractShape:
     raise CaptureError(f"a {type(shape).__name__} is no shape", where="shape", hint=hint)
 
 
-def _points(rim: Any) -> np.ndarray:
+def _points(rim: object) -> np.ndarray:
     points = as_numbers(rim)
     if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
         hint = "give an array of shape (point, 2): row and column"

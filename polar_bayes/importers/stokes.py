@@ -22,15 +22,11 @@ Source:
 """
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 
 from polar_bayes.capture.schema import as_numbers
 from polar_bayes.errors import CaptureError
-
-FEWEST_ANGLES = 3
-LARGEST_CONDITION = 100.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -65,7 +61,7 @@ class StokesImage:
         return self.covariance / np.sqrt(self.q_variance * self.u_variance)
 
 
-def fit_stokes(light: np.ndarray, variance: np.ndarray, angles: Any) -> StokesImage:
+def fit_stokes(light: np.ndarray, variance: np.ndarray, angles: object) -> StokesImage:
     """Stokes parameters by least squares."""
     design = _design(check_angles(angles))
     solve = np.linalg.pinv(design)
@@ -104,7 +100,7 @@ def unbiased_dop(image: StokesImage) -> tuple[np.ndarray, np.ndarray]:
     return p - taken, np.sqrt(error)
 
 
-def check_angles(angles: Any) -> np.ndarray:
+def check_angles(angles: object) -> np.ndarray:
     """Angles of a polarizer, refused unless they determine all three Stokes parameters."""
     degrees = as_numbers(angles)
     if degrees.ndim != 1 or not (np.abs(degrees) <= 360.0).all():
@@ -112,11 +108,11 @@ def check_angles(angles: Any) -> np.ndarray:
         raise CaptureError(f"{angles!r} are no angles", where="angles", hint=hint)
     different = np.unique(np.round(degrees % 180.0, 6) % 180.0)
     listed = ", ".join(f"{angle:g}" for angle in degrees)
-    if different.size < FEWEST_ANGLES:
+    if different.size < 3:
         what = f"the polarizer stood at {different.size} different angles ({listed})"
         raise CaptureError(what, where="angles", hint="give three or more; 0 and 180 are the same")
     condition = float(np.linalg.cond(_design(degrees)))
-    if condition > LARGEST_CONDITION:
+    if condition > 100.0:
         what = f"{listed} are so close that noise grows {condition:.0f}-fold"
         hint = "spread them over 180 degrees, such as 0, 60 and 120"
         raise CaptureError(what, where="angles", hint=hint)
@@ -133,7 +129,7 @@ def _misfit(
     light: np.ndarray, variance: np.ndarray, design: np.ndarray, solve: np.ndarray
 ) -> np.ndarray | None:
     """Mean squared residual over its variance; None where three angles leave no residual."""
-    beyond = np.linalg.svd(design)[0].T[FEWEST_ANGLES:]
+    beyond = np.linalg.svd(design)[0].T[design.shape[1] :]
     if not len(beyond):
         return None
     rest = np.einsum("ka,ayx->kyx", beyond, light)

@@ -18,30 +18,22 @@ import dataclasses
 import math
 import os
 import re
-from collections import Counter
+import sys
 from collections.abc import Collection, Mapping, Sequence
 from decimal import Decimal
 from numbers import Real
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from polar_bayes.capture.combine import DIMS, PER_VIEW, combine
-from polar_bayes.capture.schema import (
-    CONTRACT,
-    WAVELENGTH,
-    Interval,
-    hint_for,
-    nearest_name,
-    validate,
-)
+from polar_bayes.capture.schema import CONTRACT, WAVELENGTH, hint_for, nearest_name, validate
 from polar_bayes.errors import CaptureError
 from polar_bayes.paths import existing_file, system_error
 
 KNOWN = {row.name: row for row in (*CONTRACT, WAVELENGTH)}
-LARGEST = float(np.finfo(np.float64).max)
-FINITE = Interval(-LARGEST, LARGEST)
 
 
 def from_table(
@@ -143,7 +135,7 @@ def _check_constants(
     """Refuse constants that are no numbers or also columns, and missing directions."""
     for variable, value in constants.items():
         _check_name(variable, source)
-        if not (isinstance(value, Real) and FINITE.contains(value)):
+        if not (isinstance(value, Real) and abs(value) <= sys.float_info.max):
             hint = "give a finite number"
             raise CaptureError(f"{variable} is {value!r}", where=source, hint=hint)
         if variable in columns:
@@ -212,15 +204,10 @@ def _spectral(values: dict[str, np.ndarray], waves: np.ndarray) -> xr.Dataset:
 
 def _views(values: dict[str, np.ndarray], column: np.ndarray) -> np.ndarray:
     """The view of each line: one for each set of directions, and one more for each repetition."""
-    numbers: dict[tuple, int] = {}
-    repetitions: Counter[tuple] = Counter()
-    views = []
-    directions = [values[name] for name in PER_VIEW if name in values]
-    for line in zip(*directions, column, strict=True):
-        key = (*line[:-1], repetitions[line])
-        repetitions[line] += 1
-        views.append(numbers.setdefault(key, len(numbers)))
-    return np.array(views)
+    directions = {name: values[name] for name in PER_VIEW if name in values}
+    lines = pd.DataFrame({**directions, "column": column})
+    lines["repetition"] = lines.groupby([*lines], sort=False).cumcount()
+    return lines.groupby([*directions, "repetition"], sort=False).ngroup().to_numpy()
 
 
 # --- Text tables of numbers, as detectors and spreadsheets write them -----------------------------
@@ -229,8 +216,6 @@ LARGEST_FILE = 50_000_000  # bytes
 BLANKS = re.compile(r"[ \t]+")
 # A decimal comma is between digits, so the comma of "10, 5" separates.
 NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*|,[0-9]+)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?")
-LONGEST_NUMBER = 64  # characters
-MISSING = frozenset({"nan", "inf", "infinity", "na", "n/a", "none", "null"})
 EACH_READING = "give a line for each reading"
 
 Row = tuple[int, list[str]]  # line of the file, cells
@@ -349,11 +334,12 @@ def _take_header(rows: list[Row], source: str) -> tuple[list[str], list[Row]]:
 def _is_name(cell: str) -> bool:
     """Whether a cell is a name rather than a mistyped number, which must not be lost."""
     lettered = any(character.isalpha() for character in cell)
-    return lettered and cell[0] not in "0123456789+-.," and cell.lower() not in MISSING
+    is_missing = cell.lower() in ("nan", "inf", "infinity", "na", "n/a", "none", "null")
+    return lettered and cell[0] not in "0123456789+-.," and not is_missing
 
 
 def _is_number(cell: str) -> bool:
-    return len(cell) <= LONGEST_NUMBER and NUMBER.fullmatch(cell) is not None
+    return len(cell) <= 64 and NUMBER.fullmatch(cell) is not None
 
 
 def _number(cell: str, where: str) -> tuple[float, float]:

@@ -9,9 +9,9 @@ import dataclasses
 import enum
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from numpyro import distributions as dist
 
 from polar_bayes.inference.batching import ObservationBatch, Status
@@ -31,12 +31,7 @@ from polar_bayes.inference.prior_probability import has_probabilities, probabili
 from polar_bayes.inference.problem_batch import BatchDraws
 from polar_bayes.inference.program import Values
 from polar_bayes.inference.result import CENTRAL_95
-from polar_bayes.maps.residuals import (
-    Fitted,
-    direction_kernels,
-    fitted_readings,
-    residual_tail,
-)
+from polar_bayes.maps.residuals import Fitted, direction_kernels, fitted_readings, residual_tail
 from polar_bayes.numerics.psis import LEVELS, Marginals
 from polar_bayes.observation.links import PERFECT
 from polar_bayes.physics.part import absence
@@ -72,7 +67,7 @@ class Scalar:
     name: str
     index: tuple[int, ...]
 
-    def of(self, values: Mapping[str, Any]) -> np.ndarray:
+    def of(self, values: Mapping[str, ArrayLike]) -> np.ndarray:
         """Its values, (..., pixel) or (pixel, draw), among those of all parameters."""
         found = np.asarray(values[self.name])
         return found[(slice(None),) * (found.ndim - len(self.index)) + self.index]
@@ -115,13 +110,8 @@ def criteria(engine: CompiledModel, sizes: tuple[tuple[str, tuple[int, ...]], ..
     """The criteria of the parameters that have a map, by their names and sizes."""
     priors = engine.priors
     every = [scalar for name, own in sizes for scalar in _scalars(name, own)]
-    stated = [
-        each
-        for each in every
-        if each.name in priors
-        and not priors[each.name].batch_shape
-        and has_probabilities(priors[each.name])
-    ]
+    known = {n for n, x in priors.items() if not x.batch_shape and has_probabilities(x)}
+    stated = [each for each in every if each.name in known]
     judged = tuple(each for each in stated if each.name not in PERFECT)
     noise = tuple(each for each in stated if each.name in PERFECT)
     return Criteria(
@@ -160,9 +150,8 @@ def _bounds(
             if absent is None or absent.value != bound:
                 draws = scalar.of(engine.prior_parameters)[None]
                 strip = NEAR_BOUND * np.diff(np.quantile(draws, CENTRAL_95))
-                if _share_at(bound, draws, np.full((1, MOMENTS), 1.0 / MOMENTS), strip) < (
-                    MASS_AT_BOUND
-                ):
+                weights = np.full((1, MOMENTS), 1.0 / MOMENTS)
+                if _share_at(bound, draws, weights, strip) < MASS_AT_BOUND:
                     yield Bound(scalar, bound)
 
 

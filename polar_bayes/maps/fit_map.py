@@ -5,7 +5,6 @@ import enum
 import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import dask.array as da
 import jax
@@ -26,12 +25,7 @@ from polar_bayes.inference.batching import (
     cut,
 )
 from polar_bayes.inference.compiled_model import CompiledModel, compile_layout, layout_key
-from polar_bayes.inference.problem_batch import (
-    Outcome,
-    ProblemBatch,
-    empty_outcome,
-    problem_batch,
-)
+from polar_bayes.inference.problem_batch import Outcome, ProblemBatch, empty_outcome, problem_batch
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.maps.blocks import as_completed, workers
@@ -61,8 +55,6 @@ DIAGNOSTICS = {
     "approach": "method by which the numbers were found",
     "status": "status of the pixel",
 }
-
-FLAGS: dict[str, type[enum.IntEnum]] = {"approach": MethodUsed, "status": Status}
 
 FILL_VALUES = {"status": int(Status.NOT_FITTED), "criticism": UNKNOWN}
 """Of chunks in a Zarr store that are not written."""
@@ -152,7 +144,7 @@ class MapPlan:
     own_directions: frozenset[str] = dataclasses.field(compare=False)
     shared: tuple[SharedParameter, ...] = ()
     shares_by_default: bool = dataclasses.field(default=False, compare=False)
-    found: Mapping[str, Any] = dataclasses.field(default_factory=dict, compare=False)
+    found: Mapping[str, object] = dataclasses.field(default_factory=dict, compare=False)
 
     def sharing(self, names: Sequence[str]) -> "MapPlan":
         """The same request, where pixels share these parameters."""
@@ -163,11 +155,8 @@ class MapPlan:
 
     def observe(self, capture: xr.Dataset) -> Observations:
         """A block, or one pixel, as arrays."""
-        data = observe(
-            capture,
-            largest_view_zenith=self.request.largest_view_zenith,
-            intensity_unit=self.intensity_unit,
-        )
+        limit, unit = self.request.largest_view_zenith, self.intensity_unit
+        data = observe(capture, largest_view_zenith=limit, intensity_unit=unit)
         priors = jax.tree.map(jnp.asarray, as_priors(self.shared))
         return dataclasses.replace(data, shared=priors)
 
@@ -226,11 +215,8 @@ def plan_map(
         raise CaptureError(what, where=str(capture.attrs.get("name", "capture")), hint=hint)
     pixel, limit = _fullest_pixel(capture), largest_view_zenith
     request = resolve(pixel, model, scene, priors, links, limit, seed, precision)
-    own = frozenset(
-        name
-        for name in (*ANGLES, "normal_confidence")
-        if name in capture and set(IMAGE) & set(capture[name].dims)
-    )
+    known = (name for name in (*ANGLES, "normal_confidence") if name in capture)
+    own = frozenset(name for name in known if set(IMAGE) & set(capture[name].dims))
     unit = _intensity_unit(capture)
     plan = MapPlan("", request, settings, unit, own, shares_by_default=shared is None)
     if shared is None:
@@ -254,11 +240,8 @@ def _check_shared(names: Sequence[str], request: Request) -> None:
     for name in names:
         known = [each for each in request.priors if each not in MATERIAL_PARAMETERS]
         if name not in known or request.priors[name].event_shape:
-            raise FitError(
-                "an image cannot share it",
-                where=f"fit_pixels: shared={name!r}",
-                hint=f"give names among {', '.join(known)}",
-            )
+            what, hint = "an image cannot share it", f"give names among {', '.join(known)}"
+            raise FitError(what, where=f"fit_pixels: shared={name!r}", hint=hint)
 
 
 def _with_shared(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
@@ -281,10 +264,8 @@ def _with_shared(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
 
 def _sharing_nothing(plan: MapPlan, reason: str) -> MapPlan:
     """The plan in which each pixel has parameters of its own, and why."""
-    names = [each.name for each in plan.shared]
-    return dataclasses.replace(
-        plan.sharing(()), found={"not_shared": {"names": names, "reason": reason}}
-    )
+    told = {"names": [each.name for each in plan.shared], "reason": reason}
+    return dataclasses.replace(plan.sharing(()), found={"not_shared": told})
 
 
 def _with_settings(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
@@ -307,9 +288,8 @@ def _random_pixels(capture: xr.Dataset, seed: int, count: int) -> xr.Dataset:
     found: list[xr.Dataset] = []
     for begin in range(0, order.size, 2 * count):
         y, x = np.unravel_index(order[begin : begin + 2 * count], (rows, columns))
-        some = capture.drop_vars(IMAGE, errors="ignore").isel(
-            y=xr.DataArray(y, dims="x_"), x=xr.DataArray(x, dims="x_")
-        )
+        place = {"y": xr.DataArray(y, dims="x_"), "x": xr.DataArray(x, dims="x_")}
+        some = capture.drop_vars(IMAGE, errors="ignore").isel(place)
         some = mask_missing(some.load().rename(x_="x"))
         some = some.map(lambda v: v.expand_dims("y") if "x" in v.dims else v, keep_attrs=True)
         enough = np.flatnonzero(_count_views(some).transpose(*IMAGE).to_numpy()[0] >= MIN_VIEWS)
@@ -372,7 +352,7 @@ def provenance_json(plan: MapPlan) -> str:
     return json.dumps(provenance, sort_keys=True)
 
 
-def _described(parameter: SharedParameter, request: Request) -> dict[str, Any]:
+def _described(parameter: SharedParameter, request: Request) -> dict[str, object]:
     """A shared parameter in what JSON can hold."""
     with jax.enable_x64(True):
         quantiles = parameter.quantiles(request.priors[parameter.name], LEVELS)
@@ -474,7 +454,7 @@ def maps_of(
 ) -> xr.Dataset:
     """The marginals of a block, and how they are judged, as labeled maps."""
     shape = tuple(block.sizes[dim] for dim in IMAGE)
-    variables: dict[str, Any] = {}
+    variables: dict[str, tuple] = {}
     for name, (own, sizes) in plan.axes.items():
         symbol, meaning, unit = notation(name)
         statistics = [
@@ -489,23 +469,21 @@ def maps_of(
             whole = values.reshape(*values.shape[: len(first)], *shape, *sizes)
             labels = {"units": unit, "long_name": f"{statistic} {meaning}", "symbol": symbol}
             variables[f"{name}{ending}"] = ((*first, *IMAGE, *own), np.float32(whole), labels)
+    kinds: dict[str, type[enum.IntEnum]] = {"approach": MethodUsed, "status": Status}
     for name, meaning in DIAGNOSTICS.items():
-        attrs: dict[str, Any] = {"units": "1", "long_name": meaning}
-        if name in FLAGS:
-            flags = list(FLAGS[name])
-            attrs = {
-                "long_name": meaning,
-                "flag_values": [int(each) for each in flags],
-                "flag_meanings": " ".join(each.name.lower() for each in flags),
-            }
+        attrs: dict[str, object] = {"units": "1", "long_name": meaning}
+        if name in kinds:
+            attrs = _flag_attrs(meaning, "flag_values", kinds[name])
         variables[name] = (IMAGE, getattr(outcome, name).reshape(shape), attrs)
-    attrs = {
-        "long_name": "checks in which the readings speak against the model",
-        "flag_masks": [int(each) for each in Criticism],
-        "flag_meanings": " ".join(str(each.name).lower() for each in Criticism),
-    }
+    checks = "checks in which the readings speak against the model"
+    attrs = _flag_attrs(checks, "flag_masks", Criticism)
     variables["criticism"] = (IMAGE, criticism.reshape(shape), attrs)
     coords = {dim: block.coords[dim] for dim in (*IMAGE, "wavelength") if dim in block.coords}
     found_maps = xr.Dataset(variables, coords={**coords, "quantile": list(LEVELS)})
     names = [each.name for each in plan.shared]
     return found_maps.assign_coords(shared=names) if names else found_maps
+
+
+def _flag_attrs(meaning: str, key: str, kind: type[enum.IntEnum]) -> dict[str, object]:
+    names = " ".join(each.name.lower() for each in kind)
+    return {"long_name": meaning, key: [int(each) for each in kind], "flag_meanings": names}

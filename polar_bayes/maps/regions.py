@@ -23,13 +23,6 @@ from polar_bayes.inference.batching import IMAGE, Status, cut
 from polar_bayes.inference.result import CENTRAL_95
 from polar_bayes.maps.lazy import CHUNK, checked_status, map_parameters
 
-LARGEST_PULL = 0.5
-"""Of the priors of all pixels together on the mean of a region, in units of its sd, above which
-it is told: where pixels are alike, a 95% interval that is moved so far holds in 92%."""
-
-SIGNIFICANT = 3.0
-"""Standard errors from which a pull is not chance."""
-
 
 class _Sums(NamedTuple):
     """Of one parameter over the pixels of every region: each (region, ...)."""
@@ -82,9 +75,8 @@ def region_means(
     """
     names = map_parameters(maps)
     if not names or "status" not in maps:
-        raise FitError(
-            "it holds no maps", where="region_means", hint="give what fit_pixels returns"
-        )
+        hint = "give what fit_pixels returns"
+        raise FitError("it holds no maps", where="region_means", hint=hint)
     number, found = _numbered(maps, labels)
     reference = None if against is None else _position(found, against)
     counts = np.zeros((2, len(found)), int)
@@ -169,11 +161,9 @@ def load_labels(path: str | os.PathLike[str]) -> np.ndarray:
     """
     values = read_image(path, "labels")
     if values.ndim != len(IMAGE) or values.dtype.kind not in "biu":
-        raise CaptureError(
-            f"it has values of shape {values.shape} and type {values.dtype}",
-            where=f"labels {path}",
-            hint="save it with one channel of whole numbers: one gray value for each region",
-        )
+        what = f"it has values of shape {values.shape} and type {values.dtype}"
+        hint = "save it with one channel of whole numbers: one gray value for each region"
+        raise CaptureError(what, where=f"labels {path}", hint=hint)
     return values
 
 
@@ -183,11 +173,9 @@ def _numbered(maps: xr.Dataset, labels: xr.DataArray | np.ndarray) -> tuple[np.n
         labels = labels.transpose(*IMAGE).to_numpy()
     values, shape = np.asarray(labels), tuple(maps.sizes[dim] for dim in IMAGE)
     if values.shape != shape or values.dtype.kind not in "biuU":
-        raise FitError(
-            f"they are {values.dtype} of shape {values.shape}",
-            where="region_means: labels",
-            hint=f"give truth values, integers or texts, one for each of {shape} pixels",
-        )
+        what = f"they are {values.dtype} of shape {values.shape}"
+        hint = f"give truth values, integers or texts, one for each of {shape} pixels"
+        raise FitError(what, where="region_means: labels", hint=hint)
     found, number = np.unique(values, return_inverse=True)
     is_region = found != np.zeros((), found.dtype)
     if not is_region.any():
@@ -261,7 +249,8 @@ def _of_regions(sums: _Sums, count: np.ndarray, reference: int | None) -> _Sums:
 def _cautions(name: str, labels: np.ndarray, found: _Sums, shown: np.ndarray) -> Iterator[str]:
     """Where an interval would not hold if all pixels of a region were alike."""
     pull, chance, sd = np.abs(found.pull), np.sqrt(found.pull_variance), found.sd
-    is_moved = (pull > LARGEST_PULL * sd) & (pull > SIGNIFICANT * chance)
+    # Where pixels are alike, a 95% interval that is moved by half an sd holds in 92%.
+    is_moved = (pull > 0.5 * sd) & (pull > 3.0 * chance)
     is_known = found.is_pull_known
     for at in shown:
         if not np.all(is_known[at]):

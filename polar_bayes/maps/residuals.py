@@ -38,31 +38,8 @@ from polar_bayes.observation.data import Observations
 from polar_bayes.observation.distributions import MeanConcentrationBeta, SensorStudentT
 from polar_bayes.physics.geometry import Geometry, unit_vectors
 
-LEAST_NEIGHBOR = 0.01
-"""Largest weight of two neighbors below which a scale says nothing."""
-
 LEAST_READINGS, LEAST_FREEDOM = 6, 1.5
 """Readings, and what a fit leaves of their number, below which residuals are not judged."""
-
-OUTLIER = 3.0
-"""Size of a residual up to which it is no outlier, however small the others are."""
-
-STEP = 0.25
-"""Of a difference, in posterior sds: as linear as can be where single precision still tells it."""
-
-LEAST_SHARE = 0.1
-"""Share of what is known after the fit that the readings say, from which a direction of the
-parameters is taken out of the residuals."""
-
-LEAST_LEFT = 0.05
-"""Share of the noise of a reading that is left, below which it counts as this share."""
-
-SMALL = 0.1
-"""Probability of smaller residuals below which the noise is overstated, and structure below it is
-no conflict."""
-
-LIKELY = 1.8
-"""Moran's I, in sds from its mean, up to which its tail is not computed and counts as one."""
 
 HALVINGS, SMALLEST = 40, 1e-12
 """Of the interval in which a saddlepoint is searched; smallest divisor there."""
@@ -199,13 +176,15 @@ def fitted_readings(engine: CompiledModel, names: tuple[str, ...]) -> JitOnce:
             found = {n: standardize(trace[n]["fn"], trace[n]["value"]) for n in names}
             return {n: each for n, each in found.items() if each is not None}
 
-        # Differences, since the program of derivatives takes ten times as long to compile.
-        around = jax.vmap(readings)(jnp.concatenate([z[None], z + STEP * root, z - STEP * root]))
+        # Differences, since the program of derivatives takes ten times as long to compile: over so
+        # many posterior sds, as linear as can be where single precision still tells it.
+        step = 0.25
+        around = jax.vmap(readings)(jnp.concatenate([z[None], z + step * root, z - step * root]))
         fitted = {}
         for name, each in around.items():
             standard, _, unit = jax.tree.map(lambda x: x[0], each)
             above, below = jnp.split(each.center[1:], 2)
-            fitted[name] = standard, jnp.moveaxis((above - below) / (2.0 * STEP * unit), 0, -1)
+            fitted[name] = standard, jnp.moveaxis((above - below) / (2.0 * step * unit), 0, -1)
         return fitted
 
     return batched(of_pixel)
@@ -232,12 +211,14 @@ def residual_tail(
     freedom = np.maximum(freedom, LEAST_FREEDOM)
     squares = np.maximum(np.sum(e**2, axis=(1, 2)), SMALLEST)
     together = special.gammaincc(0.5 * freedom, 0.5 * squares)
-    is_outside = np.abs(e) * np.minimum(factor, 1.0)[:, None, None] > OUTLIER
-    shares = np.where(is_outside, e**2 / np.maximum(left, LEAST_LEFT), 0.0).max(axis=(1, 2))
+    # A residual of up to 3 is no outlier, however small the others are.
+    is_outside = np.abs(e) * np.minimum(factor, 1.0)[:, None, None] > 3.0
+    shares = np.where(is_outside, e**2 / np.maximum(left, 0.05), 0.0).max(axis=(1, 2))
     largest = special.betaincc(0.5, 0.5 * (freedom - 1.0), np.minimum(shares / squares, 1.0))
     tails = [together, np.where(shares > 0.0, count * largest, 1.0)]
     if kernels:
-        is_overstated = 1.0 - together < SMALL
+        # Where the noise is overstated, structure below it is no conflict.
+        is_overstated = 1.0 - together < 0.1
         neighbors = [_neighbor_tail(e, known, basis, freedom, kernel) for kernel in kernels]
         least = len(kernels) * np.min(neighbors, axis=0)
         tails.append(np.where(is_overstated, 1.0, least))
@@ -249,7 +230,8 @@ def _basis(changes: np.ndarray) -> np.ndarray:
     """An orthonormal basis of what the readings say about the parameters, zero where nothing."""
     flat = changes.reshape(len(changes), -1, changes.shape[-1])
     shares, axes = np.linalg.eigh(np.swapaxes(flat, 1, 2) @ flat)
-    scales = np.where(shares > LEAST_SHARE, 1.0 / np.sqrt(np.maximum(shares, LEAST_SHARE)), 0.0)
+    # Directions of which the readings say a tenth of what is known after the fit.
+    scales = np.where(shares > 0.1, 1.0 / np.sqrt(np.maximum(shares, 0.1)), 0.0)
     return (flat @ (axes * scales[:, None])).reshape(changes.shape)
 
 
@@ -260,7 +242,7 @@ def direction_kernels(geometry: Geometry) -> list[Float[np.ndarray, "view view"]
     apart = np.sum((both[:, None] - both) ** 2, axis=(-2, -1))
     np.fill_diagonal(apart, np.inf)
     kernels = [np.exp(-0.5 * apart / math.radians(scale) ** 2) for scale in ANGLE_SCALES]
-    return [kernel for kernel in kernels if kernel.max() > LEAST_NEIGHBOR]
+    return [kernel for kernel in kernels if kernel.max() > 0.01]  # others have no neighbors
 
 
 def _neighbor_tail(
@@ -276,7 +258,8 @@ def _neighbor_tail(
     second = np.sum((weights @ kernel**2) * weights, axis=(1, 2))
     second += np.sum(inner**2, axis=(1, 2)) - 2.0 * np.sum(near**2, axis=(1, 2, 3))
     variance = 2.0 * (second - first**2 / freedom) / (freedom * (freedom + 2.0))
-    likely = np.flatnonzero(index > first / freedom + LIKELY * np.sqrt(np.maximum(variance, 0.0)))
+    # Of a Moran's I within 1.8 sds of its mean the tail is not computed and counts as one.
+    likely = np.flatnonzero(index > first / freedom + 1.8 * np.sqrt(np.maximum(variance, 0.0)))
     tail = np.ones(len(e))
     if likely.size:
         forms = _forms(known[likely], basis[likely], kernel, index[likely])

@@ -51,14 +51,9 @@ PIXELS = 512
 """Pixels from which shared parameters are estimated. Errors of weighted means add up over pixels,
 so that many more would call for more draws of each."""
 
-LEAST_PIXELS = 32
-
 DRAWS = 256
 """Resampled draws of each pixel at which derivatives are taken. With 64, Monte Carlo errors are a
 large part of the information of 256 pixels whose readings say little that priors do not."""
-
-SCORED = 2**14
-"""Draws whose scores are computed together."""
 
 LONGEST_STEP, SHRINKAGE, GROWTH, MOST_STEPS = 4.0, 30.0, 2.0, 20
 """Of Newton's method: the longest step in sds of the priors of pixels, how fast these narrow and
@@ -95,10 +90,11 @@ class SharedParameter:
 
     def scores(self, prior: dist.Distribution, draws: Values) -> np.ndarray:
         """Standard scores of draws, in the shape of these."""
-        # Some pixels have as many draws as they need, and JAX compiles for each length.
+        # Some pixels have as many draws as they need, and JAX compiles for each length: those of
+        # 2**14 are computed together.
         with jax.enable_x64(True):
             inverse = functools.partial(_coordinates_of, dist.biject_to(prior.support))
-            x = map_elements(inverse, np.asarray(draws[self.name], float), SCORED)
+            x = map_elements(inverse, np.asarray(draws[self.name], float), 2**14)
         return (x - self.mean) / self.sd
 
 
@@ -145,11 +141,8 @@ def of_priors(
     names: Sequence[str], priors: Mapping[str, dist.Distribution]
 ) -> list[SharedParameter]:
     """The priors themselves as normal distributions, from which the search begins."""
-    found = []
-    for name in names:
-        x = np.asarray(_drawn(priors[name]), float)
-        found.append(SharedParameter(name, float(x.mean()), float(x.std())))
-    return found
+    drawn = {name: np.asarray(_drawn(priors[name]), float) for name in names}
+    return [SharedParameter(name, float(x.mean()), float(x.std())) for name, x in drawn.items()]
 
 
 def estimate_shared(
@@ -184,16 +177,13 @@ def estimate_shared(
         ]
         searching, are_followed = everywhere if is_last else once, modes is not None
         found, modes = _expectations(engine, pixels, searching, now, seed, modes)
-        count = len(found.slope)
-        if count < LEAST_PIXELS and are_followed:
+        count, least = len(found.slope), 32
+        if count < least and are_followed:
             modes = None
             continue
-        if count < LEAST_PIXELS:
-            raise FitError(
-                f"only {count} pixels have an answer (at least {LEAST_PIXELS})",
-                where=where,
-                hint="let each pixel have its own: shared=()",
-            )
+        if count < least:
+            what = f"only {count} pixels have an answer (at least {least})"
+            raise FitError(what, where=where, hint="let each pixel have its own: shared=()")
         slope, curvature = _prior_derivatives(names, priors, mean)
         total, whole = slope + found.slope.sum(axis=0), curvature + found.information.sum(axis=0)
         ratio = np.max(sd**2 * _precision(whole))
@@ -226,11 +216,8 @@ def estimate_shared(
         step = step / max(1.0, np.max(np.abs(step) / sd) / LONGEST_STEP)
         mean, reached = mean + step, np.maximum(reached, 0.5 * np.abs(step))
         sd = np.clip(reached, sd / SHRINKAGE, GROWTH * sd)
-    raise FitError(
-        f"their search has not settled in {MOST_STEPS} steps",
-        where=where,
-        hint="let each pixel have its own: shared=(), or share fewer",
-    )
+    hint = "let each pixel have its own: shared=(), or share fewer"
+    raise FitError(f"their search has not settled in {MOST_STEPS} steps", where=where, hint=hint)
 
 
 def _precision(information: np.ndarray) -> np.ndarray:

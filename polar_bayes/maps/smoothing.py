@@ -26,9 +26,6 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.batching import IMAGE, Status
 from polar_bayes.maps.lazy import checked_status, ensure_loaded
 
-DRAWS = 256
-"""By which variances are found, each with an error of a few percent at most."""
-
 
 def smooth(maps: xr.Dataset, name: str, neighbor_sd: float, *, seed: int = 0) -> xr.Dataset:
     """A parameter of a map under a prior by which neighboring pixels differ little.
@@ -93,12 +90,8 @@ def smooth(maps: xr.Dataset, name: str, neighbor_sd: float, *, seed: int = 0) ->
 def _differences(is_known: np.ndarray) -> scipy.sparse.csr_array:
     """The differences of neighbors that both have an answer, (pair, pixel)."""
     number = np.where(is_known, np.cumsum(is_known).reshape(is_known.shape) - 1, -1)
-    pairs = np.concatenate(
-        [
-            np.stack([number[1:].ravel(), number[:-1].ravel()], axis=1),
-            np.stack([number[:, 1:].ravel(), number[:, :-1].ravel()], axis=1),
-        ]
-    )
+    neighbors = (number[1:], number[:-1]), (number[:, 1:], number[:, :-1])
+    pairs = np.concatenate([np.stack(both, axis=-1).reshape(-1, 2) for both in neighbors])
     pairs = pairs[(pairs >= 0).all(axis=1)]
     rows, signs = np.repeat(np.arange(len(pairs)), 2), np.tile([1.0, -1.0], len(pairs))
     shape = len(pairs), int(is_known.sum())
@@ -111,14 +104,16 @@ def _variances(
     precision: np.ndarray,
     solve: Callable[[np.ndarray], np.ndarray],
     seed: int,
+    draws: int = 256,
 ) -> np.ndarray:
     """Diagonal of the inverse of the information matrix."""
     random, diagonal = np.random.default_rng(seed), information.diagonal()
-    # A pixel's variance given the others is known; only that of its conditional mean is drawn.
+    # A pixel's variance given the others is known; only that of its conditional mean is drawn, with
+    # an error of a few percent at most.
     squares = np.zeros(precision.size)
-    for _ in range(DRAWS):
+    for _ in range(draws):
         perturbed = np.sqrt(precision) * random.normal(size=precision.size)
         perturbed += differences.T @ random.normal(size=differences.shape[0])
         given_others = solve(perturbed) - perturbed / diagonal
         squares += given_others**2
-    return 1.0 / diagonal + squares / DRAWS
+    return 1.0 / diagonal + squares / draws

@@ -94,11 +94,8 @@ def observe(
             error = _values(capture, f"{name}_error", order)
             errors[name] = np.where(valid, error, unit) / unit
     brightness = readings.get("intensity", np.ones(shape))
-    angles = {
-        name: np.where(np.isfinite(angle), angle, 0.0)
-        for name in ANGLES
-        for angle in [_values(capture, name, order)]
-    }
+    stated = {name: _values(capture, name, order) for name in ANGLES}
+    angles = {name: np.where(np.isfinite(x), x, 0.0) for name, x in stated.items()}
     if "wavelength" in capture.coords:
         angles["wavelength"] = _values(capture, "wavelength", order)
     confidence = None

@@ -172,10 +172,8 @@ class SensorStudentT(dist.Distribution):
 
     @override
     def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Array:
-        noisy = dist.StudentT(self.degrees_of_freedom, self.location, self.scale).sample(
-            key, sample_shape
-        )
-        return jnp.clip(noisy, 0.0, self.full_scale)
+        noise = dist.StudentT(self.degrees_of_freedom, self.location, self.scale)
+        return jnp.clip(noise.sample(key, sample_shape), 0.0, self.full_scale)
 
     @override
     def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -39,6 +39,8 @@ __all__ = [
     "StudentTLink",
 ]
 
+PerView = Float[Array, "... view"]
+
 # --- Noise against brightness and view angle (the paper's section 2) ------------------------------
 
 
@@ -73,12 +75,7 @@ class ConcentrationSchedule(HTMLRepr):
         _check_range(self, "brightness_exponent", 0.0, 1.0)
         _check_range(self, "angle_exponent", 0.0, 2.0)
 
-    def concentration(
-        self,
-        scale: Float[Array, "..."],
-        brightness: Float[Array, "... view"],
-        cos_view: Float[Array, "... view"],
-    ) -> Float[Array, "... view"]:
+    def concentration(self, scale: Array, brightness: PerView, cos_view: PerView) -> PerView:
         """The concentration of each view, at least `minimum`; brightness is the recorded one."""
         gain = brightness**self.brightness_exponent * cos_view**self.angle_exponent
         return self.minimum + scale * gain
@@ -115,12 +112,7 @@ class ScaleSchedule(HTMLRepr):
         _check_range(self, "least_headroom", 1e-6, 1.0)
         _check_range(self, "least_cosine", 1e-6, 1.0)
 
-    def scale(
-        self,
-        base: Float[Array, "..."],
-        brightness: Float[Array, "... view"],
-        cos_view: Float[Array, "... view"],
-    ) -> Float[Array, "... view"]:
+    def scale(self, base: Array, brightness: PerView, cos_view: PerView) -> PerView:
         """The scale of each view, at least `base`; brightness is the predicted one."""
         # A smooth bound: a corner here would put a corner, not a peak, on top of the posterior
         # whenever a view is predicted close to full scale.
@@ -133,16 +125,12 @@ class ScaleSchedule(HTMLRepr):
         return base * growth * cosine**-self.angle_exponent
 
 
-def precision_by_confidence(
-    precision: Float[Array, "..."], confidence: Float[Array, "... view"] | None
-) -> Float[Array, "..."]:
+def precision_by_confidence(precision: Array, confidence: PerView | None) -> Array:
     """A precision, times the confidence in the stated normal."""
     return precision if confidence is None else precision * confidence
 
 
-def scale_by_confidence(
-    scale: Float[Array, "..."], confidence: Float[Array, "... view"] | None
-) -> Float[Array, "..."]:
+def scale_by_confidence(scale: Array, confidence: PerView | None) -> Array:
     """A scale of noise, over the square root of the confidence in the stated normal."""
     return scale if confidence is None else scale / jnp.sqrt(confidence)
 
@@ -150,17 +138,14 @@ def scale_by_confidence(
 def _check_range(owner: object, field: str, low: float, high: float, note: str = "") -> None:
     value = getattr(owner, field)
     if not low <= value <= high:
-        raise FitError(
-            f"{field} is {value}",
-            where=type(owner).__name__,
-            hint=f"give a number from {low:g} to {high:g}{note}",
-        )
+        hint = f"give a number from {low:g} to {high:g}{note}"
+        raise FitError(f"{field} is {value}", where=type(owner).__name__, hint=hint)
 
 
 # --- Links ----------------------------------------------------------------------------------------
 
 
-Prediction = Mapping[str, Float[Array, "... view"]]
+Prediction = Mapping[str, PerView]
 Noise = Mapping[str, Float[Array, ""]]
 
 
@@ -194,11 +179,11 @@ class AbstractLink(HTMLRepr, abc.ABC):
             A NumPyro distribution of batch shape (..., view).
         """
 
-    def center(self, name: str, prediction: Prediction, noise: Noise) -> Float[Array, "... view"]:
+    def center(self, name: str, prediction: Prediction, noise: Noise) -> PerView:
         """The reading without noise, in the unit of the reading."""
         return prediction[name]
 
-    def reading(self, value: Float[Array, "... view"]) -> Float[Array, "... view"]:
+    def reading(self, value: PerView) -> PerView:
         """The reading as the distribution takes it; unchanged unless a link says otherwise."""
         return value
 
@@ -212,18 +197,15 @@ class _DopLink(AbstractLink):
 
     def __post_init__(self) -> None:
         if not 1e-6 <= self.margin <= 1e-3:
-            raise FitError(
-                f"margin is {self.margin}",
-                where=type(self).__name__,
-                hint="give a number from 1e-6 to 1e-3, the paper's range of epsilon",
-            )
+            hint = "give a number from 1e-6 to 1e-3, the paper's range of epsilon"
+            raise FitError(f"margin is {self.margin}", where=type(self).__name__, hint=hint)
 
     @override
-    def reading(self, value: Float[Array, "... view"]) -> Float[Array, "... view"]:
+    def reading(self, value: PerView) -> PerView:
         # Readings of exactly 0 or 1 have density 0 or infinity; fits count how many there are.
         return jnp.clip(value, self.margin, 1.0 - self.margin)
 
-    def _mean(self, prediction: Prediction) -> Float[Array, "... view"]:
+    def _mean(self, prediction: Prediction) -> PerView:
         return jnp.clip(prediction["dop"], self.margin, 1.0 - self.margin)
 
 
@@ -251,11 +233,9 @@ class BetaLink(_DopLink):
     def distribution(
         self, name: str, prediction: Prediction, data: Observations, noise: Noise
     ) -> dist.Distribution:
-        concentration = self.schedule.concentration(
-            precision_by_confidence(noise["concentration_scale"], data.confidence),
-            data.brightness,
-            cos_degrees(data.geometry.view_zenith),
-        )
+        scale = precision_by_confidence(noise["concentration_scale"], data.confidence)
+        cos_view = cos_degrees(data.geometry.view_zenith)
+        concentration = self.schedule.concentration(scale, data.brightness, cos_view)
         return MeanConcentrationBeta(self._mean(prediction), concentration, self.margin)
 
 
@@ -281,9 +261,8 @@ class LogitNormalLink(_DopLink):
         mean = self._mean(prediction)
         log_odds = jnp.log(mean) - jnp.log1p(-mean)
         scale = scale_by_confidence(noise["logit_scale"], data.confidence)
-        return dist.TransformedDistribution(
-            dist.Normal(log_odds, scale), dist.transforms.SigmoidTransform()
-        )
+        share = dist.transforms.SigmoidTransform()
+        return dist.TransformedDistribution(dist.Normal(log_odds, scale), share)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -330,17 +309,12 @@ class StokesLink(AbstractLink):
 
     def __post_init__(self) -> None:
         if self.degrees_of_freedom is not None and not self.degrees_of_freedom > 2.0:
-            raise FitError(
-                f"degrees_of_freedom is {self.degrees_of_freedom}",
-                where="StokesLink",
-                hint="give a number above 2, or None for normal noise",
-            )
+            what = f"degrees_of_freedom is {self.degrees_of_freedom}"
+            hint = "give a number above 2, or None for normal noise"
+            raise FitError(what, where="StokesLink", hint=hint)
         if not 0.0 < self.least_brightness <= 1.0:
-            raise FitError(
-                f"least_brightness is {self.least_brightness}",
-                where="StokesLink",
-                hint="give a number above 0 and up to 1",
-            )
+            what = f"least_brightness is {self.least_brightness}"
+            raise FitError(what, where="StokesLink", hint="give a number above 0 and up to 1")
 
     @property
     @override
@@ -358,11 +332,9 @@ class StokesLink(AbstractLink):
     ) -> dist.Distribution:
         if self.stated_errors:
             if name not in data.errors:
-                raise FitError(
-                    f"the capture states no {name}_error",
-                    where="StokesLink(stated_errors=True)",
-                    hint="add that variable to the capture or use stated_errors=False",
-                )
+                what = f"the capture states no {name}_error"
+                hint = "add that variable to the capture or use stated_errors=False"
+                raise FitError(what, where="StokesLink(stated_errors=True)", hint=hint)
             location, scale = prediction[name], noise["stokes_error_factor"] * data.errors[name]
         else:
             light = self._brightness(prediction, data, noise)
@@ -376,9 +348,7 @@ class StokesLink(AbstractLink):
         freedom = jnp.asarray(self.degrees_of_freedom, jnp.result_type(scale))
         return dist.StudentT(freedom, location, scale)
 
-    def _brightness(
-        self, prediction: Prediction, data: Observations, noise: Noise
-    ) -> Float[Array, "... view"]:
+    def _brightness(self, prediction: Prediction, data: Observations, noise: Noise) -> PerView:
         """The light of each view over full scale, by which its polarization is known."""
         brightness = data.brightness
         if "exposure" in noise:
@@ -418,7 +388,7 @@ class StudentTLink(AbstractLink):
         _check_range(self, "degrees_of_freedom", 3.0, 7.0, ", the paper's range of nu")
 
     @override
-    def center(self, name: str, prediction: Prediction, noise: Noise) -> Float[Array, "... view"]:
+    def center(self, name: str, prediction: Prediction, noise: Noise) -> PerView:
         return noise["exposure"] * prediction[name]
 
     @override
@@ -426,9 +396,8 @@ class StudentTLink(AbstractLink):
         self, name: str, prediction: Prediction, data: Observations, noise: Noise
     ) -> dist.Distribution:
         location = self.center(name, prediction, noise)
-        scale = self.schedule.scale(
-            noise["intensity_scale"], location, cos_degrees(data.geometry.view_zenith)
-        )
+        cos_view = cos_degrees(data.geometry.view_zenith)
+        scale = self.schedule.scale(noise["intensity_scale"], location, cos_view)
         scale = scale_by_confidence(scale, data.confidence)
         return SensorStudentT(
             self.degrees_of_freedom, location, scale, data.saturated, data.full_scale

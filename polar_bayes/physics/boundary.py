@@ -53,19 +53,13 @@ class Diattenuation(NamedTuple):
 
     def scaled(self, factor: Array) -> "Diattenuation":
         """Followed by a filter that treats all light alike."""
-        return self._replace(
-            mean=factor * self.mean,
-            contrast=factor * self.contrast,
-            shortfall=factor * self.shortfall,
-        )
+        mean, contrast, shortfall = (factor * part for part in self[:3])
+        return Diattenuation(mean, contrast, shortfall, self.sin_squared)
 
     def plus(self, other: "Diattenuation") -> "Diattenuation":
         """Both paths together."""
-        return self._replace(
-            mean=self.mean + other.mean,
-            contrast=self.contrast + other.contrast,
-            shortfall=self.shortfall + other.shortfall,
-        )
+        mean, contrast, shortfall = map(jnp.add, self[:3], other[:3])
+        return Diattenuation(mean, contrast, shortfall, self.sin_squared)
 
     def times(self, other: "Diattenuation") -> "Diattenuation":
         """One after the other."""

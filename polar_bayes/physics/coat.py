@@ -87,11 +87,9 @@ class ThinFilm(AbstractCoat):
     @override
     def layers(self, parameters: Parameters, wavelength: Array | None) -> tuple[Layer, ...]:
         if wavelength is None:
-            raise SceneError(
-                "fringes depend on the wavelength, and there is none",
-                where="ThinFilm",
-                hint="give the geometry a wavelength in nm, or the capture such a coordinate",
-            )
+            what = "fringes depend on the wavelength, and there is none"
+            hint = "give the geometry a wavelength in nm, or the capture such a coordinate"
+            raise SceneError(what, where="ThinFilm", hint=hint)
         thickness = value_of(self.thickness_nm, parameters)
         index = value_of(self.refractive_index, parameters)
         return (Layer(index, wavenumber=4.0 * math.pi * thickness / wavelength),)
@@ -117,11 +115,8 @@ class CoatStack(AbstractCoat):
         names = [name for coat in self.coats for name in coat.parameters]
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
-            raise SceneError(
-                f"two coats read {', '.join(repeated)}",
-                where="CoatStack",
-                hint="name the parameters apart: ClearCoat(absorbance='lacquer_absorbance')",
-            )
+            hint = "name the parameters apart: ClearCoat(absorbance='lacquer_absorbance')"
+            raise SceneError(f"two coats read {', '.join(repeated)}", where="CoatStack", hint=hint)
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:

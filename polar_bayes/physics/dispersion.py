@@ -88,11 +88,9 @@ class Sellmeier(AbstractDispersion):
         both = (self.strengths, self.resonances)
         are_tuples = all(isinstance(each, tuple) and each for each in both)
         if not are_tuples or len(self.strengths) != len(self.resonances):
-            raise SceneError(
-                f"strengths={self.strengths!r} and resonances={self.resonances!r} do not pair",
-                where="Sellmeier",
-                hint="give two tuples of one length: Sellmeier((1.04, 0.23), (0.006, 0.02))",
-            )
+            what = f"strengths={self.strengths!r} and resonances={self.resonances!r} do not pair"
+            hint = "give two tuples of one length: Sellmeier((1.04, 0.23), (0.006, 0.02))"
+            raise SceneError(what, where="Sellmeier", hint=hint)
         super().__post_init__()
 
     @override

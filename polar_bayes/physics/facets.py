@@ -36,12 +36,7 @@ from polar_bayes.physics.geometry import (
     per_facet,
     sin_degrees,
 )
-from polar_bayes.physics.microfacet import (
-    AbstractMicrofacet,
-    AbstractShadowing,
-    Axes,
-    SlopeEllipse,
-)
+from polar_bayes.physics.microfacet import AbstractMicrofacet, AbstractShadowing, Axes, SlopeEllipse
 from polar_bayes.physics.part import Part, quotient, unit_rule
 from polar_bayes.physics.stokes import Light
 
@@ -91,11 +86,9 @@ class FacetQuadrature(Part):
         for name in ("along", "across"):
             nodes = getattr(self, name)
             if not (isinstance(nodes, int) and 1 <= nodes <= 64):
-                raise SceneError(
-                    f"{name}={nodes!r} is no number of nodes",
-                    where="FacetQuadrature",
-                    hint="give a whole number from 1 to 64",
-                )
+                what = f"{name}={nodes!r} is no number of nodes"
+                hint = "give a whole number from 1 to 64"
+                raise SceneError(what, where="FacetQuadrature", hint=hint)
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:
@@ -283,15 +276,22 @@ class Microsurface:
     distribution: AbstractMicrofacet
     shadowing: AbstractShadowing
     quadrature: FacetQuadrature
+    ellipse: SlopeEllipse
 
-    def density(self, ellipse: SlopeEllipse, geometry: Geometry, tan_squared: Array) -> Array:
+    def per_facet(self) -> "Microsurface":
+        """The same with an axis for facets in front of the views."""
+        return dataclasses.replace(self, ellipse=per_facet(self.ellipse))
+
+    def density(self, geometry: Geometry, tan_squared: Array) -> Array:
         """Facet area per steradian around the facet that mirrors the light to the viewer."""
+        ellipse = self.ellipse
         if ellipse.shear is None:
             return self.distribution.density(tan_squared, ellipse.across)
-        return self.density_of(ellipse, *mirror_slopes(geometry))
+        return self.density_of(*mirror_slopes(geometry))
 
-    def density_of(self, ellipse: SlopeEllipse, x: Array, y: Array) -> Array:
+    def density_of(self, x: Array, y: Array) -> Array:
         """Facet area per steradian around slopes towards the viewer and across."""
+        ellipse = self.ellipse
         if ellipse.shear is None:
             return self.distribution.density(x**2 + y**2, ellipse.across)
         # The slopes of an isotropic surface with the same peak that are met as often as these.
@@ -302,23 +302,24 @@ class Microsurface:
         stretch = (1.0 + x**2 + y**2) / (1.0 + alike)
         return self.distribution.density(alike, jnp.sqrt(peak)) * stretch**2
 
-    def visible(self, ellipse: SlopeEllipse, x: Array, y: Array) -> Array:
+    def visible(self, x: Array, y: Array) -> Array:
         """G1, the share of facets that see one direction."""
+        ellipse = self.ellipse
         if ellipse.shear is None:
             return self.distribution.shadowing(x**2 + y**2, ellipse.across)
         peak = ellipse.across * ellipse.along
         steepness = (ellipse.along * x) ** 2 + (ellipse.shear * x + ellipse.across * y) ** 2
         return self.distribution.shadowing(steepness / peak, jnp.sqrt(peak))
 
-    def sample(self, ellipse: SlopeEllipse, geometry: Geometry, border: Border) -> Facets:
+    def sample(self, geometry: Geometry, border: Border) -> Facets:
         r"""Facets inside a border, weighted by the area that they show to the viewer.
 
         $$ \sum_i w_i f_i \approx \int f \, \frac{v\cdot m}{\cos m} D \cos m \, dm, \qquad
            \frac{v\cdot m}{\cos m} = c_v + s_v x $$
         """
         sin_view, cos_view = sin_degrees(geometry.view_zenith), cos_degrees(geometry.view_zenith)
+        ellipse, rule = self.ellipse, self.quadrature
         dtype = jnp.result_type(float, ellipse.across, cos_view)
-        rule = self.quadrature
         if ellipse.axes is None:
             across, along = rule.rule_across(), rule.rule_along()
         else:

@@ -47,9 +47,6 @@ CLEAREST = 1e-4
 # Directions closer to the interface than this cosine count as this one.
 GRAZING = 1e-5
 
-# Added to n^2 - 1, so that the slope of the critical angle's cosine is finite at n = 1.
-STEP_FLOOR = 1e-6
-
 # Nodes of the H functions, and rounds of their iteration.
 NODES, ROUNDS = 6, 6
 
@@ -261,7 +258,8 @@ def _at_nodes(moments: _Moments) -> _Moments:
 
 def critical_cosine_squared(n: Array) -> Array:
     """Squared cosine of the critical angle, with a finite slope of its root at n = 1."""
-    return ((n - 1.0) * (n + 1.0) + STEP_FLOOR) / n**2
+    # Something is added to n^2 - 1, so that the slope of the cosine is finite at n = 1.
+    return ((n - 1.0) * (n + 1.0) + 1e-6) / n**2
 
 
 def _interface(n: Array) -> _Interface:

@@ -19,7 +19,6 @@ from polar_bayes.physics.geometry import (
     per_ray,
     sin_degrees,
 )
-from polar_bayes.physics.microfacet import SlopeEllipse
 from polar_bayes.physics.part import Parameters, Part, check_part, like, squared_rule, unit_rule
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import (
@@ -30,13 +29,8 @@ from polar_bayes.physics.stokes import (
     transmit_inward,
 )
 
-# Directions in a disc, by angle from its center and by azimuth, when counting the light that
-# enters the body: exact to 1e-6 of it while the disc is above the horizon, and to .002 (half
-# width 15, 89 degrees) where the horizon cuts it.
-DISC_NODES = 8
-
-# Zenith angles of the sky's rays, where a body asks for them.
-SKY_NODES = 8
+Beams = tuple[Geometry, Light]
+"""Rays that come from the light, and what of each enters the body."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,18 +39,13 @@ class AbstractIllumination(Part):
 
     @abc.abstractmethod
     def reflect(
-        self,
-        facets: Microsurface,
-        ellipse: SlopeEllipse,
-        stack: Stack,
-        geometry: Geometry,
-        parameters: Parameters,
+        self, facets: Microsurface, stack: Stack, geometry: Geometry, parameters: Parameters
     ) -> Light:
         """Light that facets mirror to the viewer.
 
         Args:
-            facets: How they tilt, which are seen, and how many stand for all.
-            ellipse: Their slopes in the frame of each viewer. Broadcasts with (..., view).
+            facets: How they tilt in the frame of each viewer, which are seen, and how many stand
+                for all.
             stack: What one facet is made of. Broadcasts with (..., view).
             geometry: Directions. Shape (..., view), degree.
             parameters: Material parameters by name, for those of the light itself.
@@ -88,9 +77,7 @@ class AbstractIllumination(Part):
         del parameters, geometry
         return None
 
-    def beams(
-        self, stack: Stack, geometry: Geometry, parameters: Parameters
-    ) -> tuple[Geometry, Light]:
+    def beams(self, stack: Stack, geometry: Geometry, parameters: Parameters) -> Beams:
         """Light that passes into the body, ray by ray; see `rays` and `entering`."""
         rays, irradiance = self.rays(geometry)
         cos_light = cos_degrees(rays.light_zenith)
@@ -124,12 +111,7 @@ class PointSource(AbstractIllumination):
 
     @override
     def reflect(
-        self,
-        facets: Microsurface,
-        ellipse: SlopeEllipse,
-        stack: Stack,
-        geometry: Geometry,
-        parameters: Parameters,
+        self, facets: Microsurface, stack: Stack, geometry: Geometry, parameters: Parameters
     ) -> Light:
         facet = mirror_facet(geometry)
         cos_view, cos_light = cos_degrees(geometry.view_zenith), cos_degrees(geometry.light_zenith)
@@ -137,13 +119,11 @@ class PointSource(AbstractIllumination):
         to_light = sin_degrees(geometry.light_zenith) / cos_light
         azimuth = geometry.light_azimuth - geometry.view_azimuth
         seen = facets.shadowing.both(
-            facets.visible(ellipse, to_viewer, jnp.zeros_like(to_viewer)),
-            facets.visible(
-                ellipse, to_light * cos_degrees(azimuth), to_light * sin_degrees(azimuth)
-            ),
+            facets.visible(to_viewer, jnp.zeros_like(to_viewer)),
+            facets.visible(to_light * cos_degrees(azimuth), to_light * sin_degrees(azimuth)),
         )
         mirrored = mirror_light(stack, facet, geometry, self.incident(parameters, geometry))
-        density = facets.density(ellipse, geometry, facet.tan_squared_tilt)
+        density = facets.density(geometry, facet.tan_squared_tilt)
         return mirrored._replace(intensity=density * seen / (4.0 * cos_view) * mirrored.intensity)
 
     @override
@@ -188,24 +168,17 @@ class AbstractExtendedSource(AbstractIllumination):
 
     @override
     def reflect(
-        self,
-        facets: Microsurface,
-        ellipse: SlopeEllipse,
-        stack: Stack,
-        geometry: Geometry,
-        parameters: Parameters,
+        self, facets: Microsurface, stack: Stack, geometry: Geometry, parameters: Parameters
     ) -> Light:
         sin_view, cos_view = sin_degrees(geometry.view_zenith), cos_degrees(geometry.view_zenith)
-        sample = facets.sample(ellipse, geometry, self.border)
+        sample = facets.sample(geometry, self.border)
         power = per_facet(stack).relative_reflection(sample.cos_incidence, sample.sin_squared)
         cos_light = jnp.clip(sample.cos_light, 1e-6, 1.0)
         to_viewer = sin_view / cos_view
         seen = facets.shadowing.both(
-            facets.visible(ellipse, to_viewer, jnp.zeros_like(to_viewer))[..., None, :],
-            facets.visible(
-                per_facet(ellipse),
-                sample.light_in_plane / cos_light,
-                sample.light_out_of_plane / cos_light,
+            facets.visible(to_viewer, jnp.zeros_like(to_viewer))[..., None, :],
+            facets.per_facet().visible(
+                sample.light_in_plane / cos_light, sample.light_out_of_plane / cos_light
             ),
         )
         lit = sample.weight * seen
@@ -231,18 +204,13 @@ class UniformSky(AbstractExtendedSource):
     def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
         # A squared cosine for the nodes, since transmission is steep at grazing. Four azimuths sum
         # up once and twice around to nothing, which is all that scattering knows of azimuth.
-        cosine, weight = squared_rule(SKY_NODES)
-        solid_angle = 0.5 * np.pi * weight
+        cosine, weight = squared_rule(8)
         rays = per_ray(geometry)
-        zenith, azimuth = np.degrees(np.arccos(cosine)), 90.0 * np.arange(4.0)
-        around = like(np.tile(azimuth, SKY_NODES), rays.view_azimuth)
-        return (
-            rays._replace(
-                light_zenith=like(np.repeat(zenith, 4), rays.view_zenith),
-                light_azimuth=rays.view_azimuth + around,
-            ),
-            like(np.repeat(solid_angle, 4), rays.view_zenith),
-        )
+        columns = np.degrees(np.arccos(cosine)), 0.5 * np.pi * weight
+        zenith, solid_angle = (like(np.repeat(x, 4), rays.view_zenith) for x in columns)
+        around = like(np.tile(90.0 * np.arange(4.0), cosine.size), rays.view_azimuth)
+        rays = rays._replace(light_zenith=zenith, light_azimuth=rays.view_azimuth + around)
+        return rays, solid_angle
 
 
 @dataclasses.dataclass(frozen=True)
@@ -260,11 +228,9 @@ class Disc(AbstractExtendedSource):
 
     def __post_init__(self) -> None:
         if not 0.01 <= self.half_width <= 90.0:
-            raise SceneError(
-                f"half_width={self.half_width!r} is no half width of a disc",
-                where="Disc",
-                hint="give degrees from 0.01 to 90, or use PointSource() or UniformSky()",
-            )
+            what = f"half_width={self.half_width!r} is no half width of a disc"
+            hint = "give degrees from 0.01 to 90, or use PointSource() or UniformSky()"
+            raise SceneError(what, where="Disc", hint=hint)
 
     @override
     def border(self, sin_view: Array, cos_view: Array) -> Window:
@@ -301,27 +267,23 @@ class Disc(AbstractExtendedSource):
         azimuth = jnp.rad2deg(jnp.arctan2(across, forwards))
         irradiance = jnp.where(up > 0.0, 0.5 * solid_angle, 0.0)
         # Both sides of the plane of the viewer.
-        both = jnp.concatenate([azimuth, -azimuth], axis=-1)
-        return (
-            rays._replace(
-                light_zenith=jnp.concatenate([zenith, zenith], axis=-1),
-                light_azimuth=rays.view_azimuth + both,
-            ),
-            jnp.concatenate([irradiance, irradiance], axis=-1),
-        )
+        azimuth = jnp.concatenate([azimuth, -azimuth], axis=-1)
+        zenith, irradiance = (jnp.concatenate([x, x], axis=-1) for x in (zenith, irradiance))
+        rays = rays._replace(light_zenith=zenith, light_azimuth=rays.view_azimuth + azimuth)
+        return rays, irradiance
 
     def _directions(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Cosine from the axis, sine times cosine of azimuth, and solid angle of each direction."""
-        node, weight = unit_rule(DISC_NODES)
+        # Exact to 1e-6 of the light that enters the body while the disc is above the horizon, and
+        # to .002 (half width 15, 89 degrees) where the horizon cuts it.
+        count = 8  # of angles from the center, and of azimuths
+        node, weight = unit_rule(count)
         # Equal steps in the squared sine of half the angle are equal solid angles.
         square = math.sin(math.radians(self.half_width) / 2.0) ** 2
         ring = node * square
         cosine = 1.0 - 2.0 * ring
         sine = 2.0 * np.sqrt(ring * (1.0 - ring))
-        azimuth = np.pi * (np.arange(DISC_NODES) + 0.5) / DISC_NODES
-        ring_solid_angle = 4.0 * np.pi * weight * square / DISC_NODES
-        return (
-            np.repeat(cosine, DISC_NODES),
-            np.outer(sine, np.cos(azimuth)).ravel(),
-            np.repeat(ring_solid_angle, DISC_NODES),
-        )
+        azimuth = np.pi * (np.arange(count) + 0.5) / count
+        ring_solid_angle = 4.0 * np.pi * weight * square / count
+        along = np.outer(sine, np.cos(azimuth)).ravel()
+        return np.repeat(cosine, count), along, np.repeat(ring_solid_angle, count)

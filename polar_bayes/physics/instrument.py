@@ -112,18 +112,14 @@ class Instrument(HTMLRepr):
         if not isinstance(self.terms, tuple) or not all(
             isinstance(term, AbstractInstrumentTerm) for term in self.terms
         ):
-            raise SceneError(
-                f"{self.terms!r} is no tuple of instrument terms",
-                where="Instrument",
-                hint="write Instrument((DolpGain(), AngleZero())), with both pairs of brackets",
-            )
+            what = f"{self.terms!r} is no tuple of instrument terms"
+            hint = "write Instrument((DolpGain(), AngleZero())), with both pairs of brackets"
+            raise SceneError(what, where="Instrument", hint=hint)
         names = [type(term).__name__ for term in self.terms]
         if len(set(names)) < len(names):
-            raise SceneError(
-                f"the terms {', '.join(names)} repeat one",
-                where="Instrument",
-                hint="give each term once, since its parameters have one name",
-            )
+            what = f"the terms {', '.join(names)} repeat one"
+            hint = "give each term once, since its parameters have one name"
+            raise SceneError(what, where="Instrument", hint=hint)
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -267,11 +263,8 @@ class Analyzer(AbstractInstrumentTerm):
         angles = self.angle if isinstance(self.angle, tuple) else (self.angle,)
         for angle in angles:
             if isinstance(angle, str):
-                raise SceneError(
-                    f"{angle!r} is no angle",
-                    where="Analyzer",
-                    hint="give degrees, or a tuple with one number for each view",
-                )
+                hint = "give degrees, or a tuple with one number for each view"
+                raise SceneError(f"{angle!r} is no angle", where="Analyzer", hint=hint)
             check_setting(angle, "Analyzer: angle", -360.0, 360.0)
 
     @override
@@ -299,11 +292,8 @@ class Saturation(AbstractInstrumentTerm):
     @override
     def __post_init__(self) -> None:
         if isinstance(self.level, str) or not self.level > 0.0:
-            raise SceneError(
-                f"level={self.level!r} is no full scale",
-                where="Saturation",
-                hint="give a number above 0",
-            )
+            what = f"level={self.level!r} is no full scale"
+            raise SceneError(what, where="Saturation", hint="give a number above 0")
 
     @override
     def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
@@ -311,10 +301,6 @@ class Saturation(AbstractInstrumentTerm):
 
 
 # --- A tilted normal: what a patch sees if it is not level ----------------------------------------
-
-
-# Largest tilt along either axis, in degrees: a sampler may ask for more, and gets this.
-LARGEST_TILT = 80.0
 
 
 class Direction(NamedTuple):
@@ -365,8 +351,8 @@ class TiltedNormal(Part):
     ) -> tuple[Geometry, tuple[Array, Array]]:
         """Directions in the frame of the true normal, and the turn of the viewer's frame."""
         tilts = (value_of(tilt, parameters) for tilt in (self.tilt_x, self.tilt_y))
-        bounded = (jnp.deg2rad(jnp.clip(tilt, -LARGEST_TILT, LARGEST_TILT)) for tilt in tilts)
-        slopes = [jnp.tan(tilt) for tilt in bounded]
+        # A sampler may ask for more than 80 degrees along an axis, and gets 80.
+        slopes = [jnp.tan(jnp.deg2rad(jnp.clip(tilt, -80.0, 80.0))) for tilt in tilts]
         view = tilted_direction(geometry.view_zenith, geometry.view_azimuth, *slopes)
         light = tilted_direction(geometry.light_zenith, geometry.light_azimuth, *slopes)
         inside = Geometry(
@@ -467,11 +453,9 @@ class Discrepancy(AbstractInstrumentTerm):
     @override
     def __post_init__(self) -> None:
         if not (isinstance(self.basis, int) and self.basis >= 1 and self.length > 0.0):
-            raise SceneError(
-                f"basis={self.basis!r} and length={self.length!r} make no smooth function",
-                where="Discrepancy",
-                hint="give a whole number of functions from 1 on and a length above 0 degrees",
-            )
+            what = f"basis={self.basis!r} and length={self.length!r} make no smooth function"
+            hint = "give a whole number of functions from 1 on and a length above 0 degrees"
+            raise SceneError(what, where="Discrepancy", hint=hint)
 
     @override
     def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:

@@ -53,11 +53,9 @@ class DopMixing(AbstractMixing):
         if self.signed:
             q = _blend(fraction, surface.q, subsurface.q)
             return Light(intensity, q, _blend(fraction, surface.u, subsurface.u))
-        length = _blend(
-            fraction,
-            degree_of_linear_polarization(surface.q, surface.u),
-            degree_of_linear_polarization(subsurface.q, subsurface.u),
-        )
+        first = degree_of_linear_polarization(surface.q, surface.u)
+        second = degree_of_linear_polarization(subsurface.q, subsurface.u)
+        length = _blend(fraction, first, second)
         towards_q, towards_u = direction(surface.q, surface.u)
         return Light(intensity, length * towards_q, length * towards_u)
 

@@ -56,7 +56,7 @@ class Part(HTMLRepr, abc.ABC):
                 names.append(value)
         return tuple(dict.fromkeys(names))
 
-    def _values(self) -> Iterator[tuple[str, Range | None, Any]]:
+    def _values(self) -> Iterator[tuple[str, Range | None, object]]:
         """Every field with its range and its value, or each value of its tuple."""
         for field in dataclasses.fields(self):
             notes = getattr(field.type, "__metadata__", ())
@@ -94,9 +94,8 @@ def value_of(setting: Setting, parameters: Parameters) -> Array:
 
 def parameters_of(*parts: Any) -> tuple[str, ...]:
     """The parameters that several parts read, each once; a part may be None."""
-    return tuple(
-        dict.fromkeys(name for part in parts if part is not None for name in part.parameters)
-    )
+    names = (name for part in parts if part is not None for name in part.parameters)
+    return tuple(dict.fromkeys(names))
 
 
 def check_part(value: object, where: str, kind: type, allowed: str) -> None:
@@ -111,11 +110,9 @@ def check_setting(value: object, where: str, low: float, high: float) -> None:
         return
     numeric = isinstance(value, int | float) and not isinstance(value, bool)
     if not (numeric and low <= value <= high):  # type: ignore[operator]
-        raise SceneError(
-            f"{value!r} is neither a number from {low:g} to {high:g} nor a parameter's name",
-            where=where,
-            hint="give the number where it is known, or a name such as 'coat_absorbance' to fit it",
-        )
+        what = f"{value!r} is neither a number from {low:g} to {high:g} nor a parameter's name"
+        hint = "give the number where it is known, or a name such as 'coat_absorbance' to fit it"
+        raise SceneError(what, where=where, hint=hint)
 
 
 def unit_rule(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -165,7 +162,7 @@ class Quantity(NamedTuple):
     unit: str = "1"
 
 
-NOTATION: dict[str, Quantity] = {
+MATERIAL: dict[str, Quantity] = {
     "roughness": Quantity("r", "roughness"),
     "subsurface_fraction": Quantity("beta", "subsurface fraction"),
     "absorption": Quantity("a", "absorption relative to scattering"),
@@ -183,14 +180,19 @@ NOTATION: dict[str, Quantity] = {
     "coat_absorbance": Quantity("", "absorbance of the coat at normal incidence"),
     "film_refractive_index": Quantity("", "refractive index of the film"),
     "film_thickness": Quantity("", "thickness of the film", "nm"),
+    "normal_tilt_x": Quantity("", "lean of the normal towards azimuth 0", "degree"),
+    "normal_tilt_y": Quantity("", "lean of the normal towards azimuth 90", "degree"),
+}
+"""Of a material, in the order in which they are listed; the others belong to a whole capture."""
+
+NOTATION: dict[str, Quantity] = {
+    **MATERIAL,
     "refractive_index_level": Quantity("", "level of n over wavelength"),
     "refractive_index_amplitude": Quantity("", "departure of n from its level"),
     "refractive_index_length": Quantity("", "length over which n changes", "nm"),
     "absorption_level": Quantity("", "level of a over wavelength"),
     "absorption_amplitude": Quantity("", "departure of log a from its level"),
     "absorption_length": Quantity("", "length over which a changes", "nm"),
-    "normal_tilt_x": Quantity("", "lean of the normal towards azimuth 0", "degree"),
-    "normal_tilt_y": Quantity("", "lean of the normal towards azimuth 90", "degree"),
     "angle_zero": Quantity("", "offset of both zenith angles", "degree"),
     "beam_overlap_zenith": Quantity("", "zenith where the beam fills the sample", "degree"),
     "dolp_gain": Quantity("", "share of the polarization that is recorded"),
@@ -235,15 +237,10 @@ ABSENT: dict[str, Absence] = {
 """The simplest world: a bare and smooth surface, and an instrument without faults."""
 
 
-POPULATION = {
-    "_location": "population median of",
-    "_spread": "population spread of",
-}
-
-
 def notation(name: str) -> Quantity:
     """The row of a parameter, or of its population, or one made of its name."""
-    for ending, words in POPULATION.items():
+    population = {"_location": "population median of", "_spread": "population spread of"}
+    for ending, words in population.items():
         if name.endswith(ending) and name.removesuffix(ending) in NOTATION:
             _, meaning, unit = NOTATION[name.removesuffix(ending)]
             return Quantity("", f"{words} {meaning}", unit if ending == "_location" else "1")

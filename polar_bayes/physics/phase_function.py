@@ -43,9 +43,6 @@ from polar_bayes.physics.part import (
     value_of,
 )
 
-# Mean cosine of diffuse light.
-MEAN_COSINE = 2.0 / 3.0
-
 MOST_ANISOTROPY = 0.9
 
 # Of the table of multiple scattering: orders in azimuth, and polynomials of each variable.
@@ -148,12 +145,8 @@ class HenyeyGreenstein(AbstractPhaseFunction):
         of_orders = _of_orders(g, gamma)
         trapped, turned = 1.0 - escape, _mean_cosine(parameters["refractive_index"], escape)
         incident, leaving, back = (
-            _direction(jnp.maximum(cosine, GRAZING), sine, gamma)
-            for cosine, sine in (
-                (light.cosine, light.sine),
-                (view.cosine, view.sine),
-                (turned, jnp.sqrt(1.0 - turned**2)),
-            )
+            _direction(jnp.maximum(ray.cosine, GRAZING), ray.sine, gamma)
+            for ray in (light, view, Ray(turned, jnp.sqrt(1.0 - turned**2)))
         )
 
         def mean(one: _Direction, other: _Direction, azimuths: Sequence[ArrayLike]) -> Array:
@@ -229,7 +222,7 @@ def _mean_cosine(refractive_index: Array, escape: Array) -> Array:
     """Of light that the interface turns back."""
     critical = critical_cosine_squared(refractive_index)
     beyond = critical / jnp.maximum(1.0 - escape, critical)
-    return MEAN_COSINE * (1.0 - (1.0 - jnp.sqrt(critical)) * beyond)
+    return 2.0 / 3.0 * (1.0 - (1.0 - jnp.sqrt(critical)) * beyond)
 
 
 def _isotropic_h(cosine: Array, g: Array) -> tuple[Array, Array]:

@@ -27,7 +27,7 @@ from polar_bayes.physics.instrument import (
 )
 from polar_bayes.physics.microfacet import Beckmann, HeightCorrelatedShadowing
 from polar_bayes.physics.mixing import AbstractMixing, DopMixing, StokesMixing
-from polar_bayes.physics.part import Parameters, check_part, notation, parameters_of
+from polar_bayes.physics.part import MATERIAL, Parameters, check_part, notation, parameters_of
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import Light, degree_of_linear_polarization, to_stokes
 from polar_bayes.physics.subsurface import AbstractSubsurface, Depolarizer, Lambertian, Unpolarized
@@ -40,29 +40,7 @@ from polar_bayes.physics.surface import (
 )
 from polar_bayes.repr_html import HTMLRepr, Row, Table
 
-# Parameters of a material, in the order in which they are listed; every other one that a scene
-# reads belongs to the whole capture.
-MATERIAL_PARAMETERS = (
-    "roughness",
-    "subsurface_fraction",
-    "absorption",
-    "refractive_index",
-    "roughness_across",
-    "roughness_azimuth",
-    "albedo",
-    "anisotropy",
-    "polarized_fraction",
-    "cauchy_a",
-    "cauchy_b",
-    "sellmeier_strength",
-    "sellmeier_resonance",
-    "coat_refractive_index",
-    "coat_absorbance",
-    "film_refractive_index",
-    "film_thickness",
-    "normal_tilt_x",
-    "normal_tilt_y",
-)
+MATERIAL_PARAMETERS = tuple(MATERIAL)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,31 +76,22 @@ class Scene(HTMLRepr):
     def __post_init__(self) -> None:
         check_part(self.surface, "surface", AbstractSurface, "SmoothSurface() or RoughSurface()")
         for name, kind, allowed in (
-            (
-                "subsurface",
-                AbstractSubsurface,
-                "Unpolarized(), Lambertian(), Depolarizer() or None",
-            ),
-            ("mixing", AbstractMixing, "DopMixing(), StokesMixing() or None"),
-            ("coat", AbstractCoat, "ClearCoat(), ThinFilm(), CoatStack((...)) or None"),
-            ("instrument", Instrument, "Instrument((DolpGain(), ...)) or None"),
-            ("dispersion", AbstractDispersion, "Cauchy(), Sellmeier() or None"),
-            ("normal", TiltedNormal, "TiltedNormal() or None"),
+            ("subsurface", AbstractSubsurface, "Unpolarized(), Lambertian(), Depolarizer()"),
+            ("mixing", AbstractMixing, "DopMixing(), StokesMixing()"),
+            ("coat", AbstractCoat, "ClearCoat(), ThinFilm(), CoatStack((...))"),
+            ("instrument", Instrument, "Instrument((DolpGain(), ...))"),
+            ("dispersion", AbstractDispersion, "Cauchy(), Sellmeier()"),
+            ("normal", TiltedNormal, "TiltedNormal()"),
         ):
             if getattr(self, name) is not None:
-                check_part(getattr(self, name), name, kind, allowed)
+                check_part(getattr(self, name), name, kind, f"{allowed} or None")
         if self.mixing is not None and self.subsurface is None:
-            raise SceneError(
-                "there is no subsurface to mix",
-                where="mixing",
-                hint="give a subsurface, such as Depolarizer(), or leave mixing=None",
-            )
+            hint = "give a subsurface, such as Depolarizer(), or leave mixing=None"
+            raise SceneError("there is no subsurface to mix", where="mixing", hint=hint)
         if self.subsurface is not None and self.mixing is None:
-            raise SceneError(
-                "nothing says how its light adds to the surface's",
-                where="subsurface",
-                hint="give mixing=StokesMixing() or DopMixing(), or leave subsurface=None",
-            )
+            what = "nothing says how its light adds to the surface's"
+            hint = "give mixing=StokesMixing() or DopMixing(), or leave subsurface=None"
+            raise SceneError(what, where="subsurface", hint=hint)
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -232,11 +201,8 @@ class Scene(HTMLRepr):
         rest = tuple(part for part in terms if not isinstance(part, term))
         if len(rest) == len(terms):
             present = ", ".join(type(part).__name__ for part in terms) or "none"
-            raise SceneError(
-                f"the scene has no {term.__name__}",
-                where="without",
-                hint=f"name one of its instrument terms: {present}",
-            )
+            hint = f"name one of its instrument terms: {present}"
+            raise SceneError(f"the scene has no {term.__name__}", where="without", hint=hint)
         return dataclasses.replace(self, instrument=Instrument(rest) if rest else None)
 
     def _optics(self, parameters: Parameters, geometry: Geometry) -> Light:
@@ -264,11 +230,9 @@ class Scene(HTMLRepr):
 
     def _wavelength(self, geometry: Geometry) -> Array:
         if geometry.wavelength is None:
-            raise SceneError(
-                "a law of dispersion needs a wavelength, and there is none",
-                where="dispersion",
-                hint="give the geometry a wavelength in nm, or the capture such a coordinate",
-            )
+            what = "a law of dispersion needs a wavelength, and there is none"
+            hint = "give the geometry a wavelength in nm, or the capture such a coordinate"
+            raise SceneError(what, where="dispersion", hint=hint)
         return geometry.wavelength
 
     def _per_view(
@@ -279,11 +243,8 @@ class Scene(HTMLRepr):
         needed = [name for name in self.parameters if name in names]
         missing = [name for name in needed if name not in parameters]
         if missing:
-            raise SceneError(
-                f"{', '.join(missing)} missing",
-                where="parameters",
-                hint=f"this scene reads {', '.join(needed)}",
-            )
+            hint = f"this scene reads {', '.join(needed)}"
+            raise SceneError(f"{', '.join(missing)} missing", where="parameters", hint=hint)
         dtype = jnp.result_type(geometry.dtype, *(parameters[name] for name in needed))
         return {name: jnp.asarray(parameters[name], dtype)[..., None] for name in needed}
 
@@ -331,9 +292,7 @@ _FULL_SURFACE = RoughSurface(
 
 FULL_SCENES: dict[str, Scene] = {
     "paper": dataclasses.replace(
-        SCENES["paper"],
-        surface=_FULL_SURFACE,
-        instrument=Instrument((AngleZero(), DarkLevel())),
+        SCENES["paper"], surface=_FULL_SURFACE, instrument=Instrument((AngleZero(), DarkLevel()))
     ),
     "camera": dataclasses.replace(
         SCENES["camera"],

@@ -27,16 +27,9 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.facets import Facets, seen
-from polar_bayes.physics.geometry import (
-    Geometry,
-    cos_degrees,
-    double_angle,
-    per_facet,
-    sin_degrees,
-)
+from polar_bayes.physics.facets import Facets, Microsurface, seen
+from polar_bayes.physics.geometry import Geometry, cos_degrees, double_angle, per_facet, sin_degrees
 from polar_bayes.physics.illumination import PointSource, UniformSky
-from polar_bayes.physics.microfacet import SlopeEllipse
 from polar_bayes.physics.part import Parameters, Part, at_least, quotient
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import Light
@@ -95,11 +88,9 @@ class TwoBounceSurface(RoughSurface):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.illumination not in (PointSource(), UniformSky()):
-            raise SceneError(
-                f"{self.illumination!r} has no second bounce",
-                where="TwoBounceSurface: illumination",
-                hint="give PointSource() or UniformSky(), or use RoughSurface",
-            )
+            what = f"{self.illumination!r} has no second bounce"
+            hint = "give PointSource() or UniformSky(), or use RoughSurface"
+            raise SceneError(what, where="TwoBounceSurface: illumination", hint=hint)
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:
@@ -118,19 +109,19 @@ class TwoBounceSurface(RoughSurface):
 
     def _twice(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Vector:
         """S0, S1 and S2 of the second bounce."""
-        ellipse = self.slopes.ellipse(parameters, geometry)
-        first = both_sides(self.facets.sample(ellipse, geometry, seen))
+        facets = self.facets(parameters, geometry)
+        first = both_sides(facets.sample(geometry, seen))
         sin_view, cos_view = sin_degrees(geometry.view_zenith), cos_degrees(geometry.view_zenith)
         zero = jnp.zeros_like(sin_view)
         ray = Vector(first.light_in_plane, first.light_out_of_plane, first.cos_light)
-        hidden = first.weight * self._open(per_facet(ellipse), ray)
-        share = hidden * self._open(ellipse, Vector(sin_view, zero, cos_view))[..., None, :]
+        hidden = first.weight * _open(facets.per_facet(), ray)
+        share = hidden * _open(facets, Vector(sin_view, zero, cos_view))[..., None, :]
 
         back = jax.tree.map(jnp.negative, ray)
         view = Vector(*(x[..., None, :] for x in (sin_view, zero, cos_view)))
         axis = view.across(back)
         if isinstance(self.illumination, PointSource):
-            arriving = self._from_point(ellipse, stack, geometry, back, axis)
+            arriving = self._from_point(facets.per_facet(), stack, geometry, back, axis)
         else:
             arriving = self._from_sky(parameters, stack, geometry, back, axis)
 
@@ -142,20 +133,11 @@ class TwoBounceSurface(RoughSurface):
         q = contrast * arriving.x + power.mean * arriving.y
         cos, sin = double_angle(axis.y, view.z * -axis.x + view.x * axis.z)
         u = -power.cross * arriving.z
-        return Vector(
-            *(
-                jnp.sum(share * each, axis=-2)
-                for each in (intensity, q * cos - u * sin, q * sin + u * cos)
-            )
-        )
-
-    def _open(self, ellipse: SlopeEllipse, ray: Vector) -> Array:
-        """G1 over the cosine of a ray that goes up or down."""
-        cosine = jnp.maximum(jnp.abs(ray.z), LEAST)
-        return self.facets.visible(ellipse, ray.x / cosine, ray.y / cosine) / cosine
+        stokes = (intensity, q * cos - u * sin, q * sin + u * cos)
+        return Vector(*(jnp.sum(share * each, axis=-2) for each in stokes))
 
     def _from_point(
-        self, ellipse: SlopeEllipse, stack: Stack, geometry: Geometry, back: Vector, axis: Vector
+        self, facets: Microsurface, stack: Stack, geometry: Geometry, back: Vector, axis: Vector
     ) -> Vector:
         """Stokes vector that arrives at each first facet, in its frame, over the share hidden."""
         turn = (geometry.light_azimuth - geometry.view_azimuth)[..., None, :]
@@ -165,10 +147,9 @@ class TwoBounceSurface(RoughSurface):
         length = jnp.sqrt(jnp.maximum(middle.dot(middle), LEAST))
         normal = middle.times(1.0 / length)
         upright = jnp.maximum(normal.z, LEAST)
-        ellipse = per_facet(ellipse)
-        density = self.facets.density_of(ellipse, normal.x / upright, normal.y / upright)
+        density = facets.density_of(normal.x / upright, normal.y / upright)
         density = jnp.where(normal.z > LEAST, density, 0.0)
-        lit = 0.25 * density * self._open(ellipse, light) * light.z
+        lit = 0.25 * density * _open(facets, light) * light.z
         return _mirrored(per_facet(stack), lit, 0.5 * length, back, light, axis)
 
     def _from_sky(
@@ -176,8 +157,8 @@ class TwoBounceSurface(RoughSurface):
     ) -> Vector:
         """The same from a sky of unit radiance: every facet, as the plane's own area shows it."""
         above = geometry._replace(view_zenith=jnp.zeros_like(geometry.view_zenith))
-        ellipse = self.slopes.ellipse(parameters, above)
-        second = both_sides(self.facets.sample(ellipse, above, seen))
+        facets = self.facets(parameters, above)
+        second = both_sides(facets.sample(above, seen))
         # An axis in front of that of the first facets: (..., second, 1, view).
         second = jax.tree.map(lambda values: values[..., :, None, :], second)
         normal = Vector(
@@ -186,10 +167,16 @@ class TwoBounceSurface(RoughSurface):
         back, axis = (Vector(*(x[..., None, :, :] for x in each)) for each in (back, axis))
         cosine = jnp.maximum(back.dot(normal), 0.0)
         light = Vector(*(2.0 * cosine * m - b for m, b in zip(normal, back, strict=True)))
-        free = self._open(per_facet(per_facet(ellipse)), light) * jnp.maximum(light.z, 0.0)
+        free = _open(facets.per_facet().per_facet(), light) * jnp.maximum(light.z, 0.0)
         lit = second.weight * cosine / second.cos_incidence * free
         arriving = _mirrored(per_facet(per_facet(stack)), lit, cosine, back, light, axis)
         return Vector(*(jnp.sum(each, axis=-3) for each in arriving))
+
+
+def _open(facets: Microsurface, ray: Vector) -> Array:
+    """G1 over the cosine of a ray that goes up or down."""
+    cosine = jnp.maximum(jnp.abs(ray.z), LEAST)
+    return facets.visible(ray.x / cosine, ray.y / cosine) / cosine
 
 
 def _mirrored(

@@ -133,9 +133,8 @@ class Stack(NamedTuple):
         end = jnp.minimum(self.refractive_index, lowest.refractive_index) ** 2
         beyond = (end - 1.0)[..., None] * like(TRAPPED_SHARE, self.refractive_index)
         absorbed = per_ray(self)._not_returned(-beyond, 1.0 + beyond, reaches_air=False)
-        return (end - 1.0) * jnp.sum(
-            like(TRAPPED_WEIGHT, self.refractive_index) * absorbed, axis=-1
-        )
+        weight = like(TRAPPED_WEIGHT, self.refractive_index)
+        return (end - 1.0) * jnp.sum(weight * absorbed, axis=-1)
 
     def _bare(self, cos_incidence: Array) -> tuple[Medium, Medium]:
         """Air and body."""
@@ -238,12 +237,8 @@ def _boundaries(
             thin = tuple(_film(film, cos_squared) for film in films)
             powers.append(boundary.filmed(above, thin, below, sin_squared))
         else:
-            powers.append(
-                (
-                    boundary.reflection(above, below, sin_squared),
-                    boundary.transmission(above, below, sin_squared),
-                )
-            )
+            mirrored = boundary.reflection(above, below, sin_squared)
+            powers.append((mirrored, boundary.transmission(above, below, sin_squared)))
         above = below
     return powers
 

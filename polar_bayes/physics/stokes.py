@@ -53,10 +53,8 @@ class Light(NamedTuple):
 
 def to_stokes(light: Light) -> Array:
     """Stokes vector (S0, S1, S2) on a new last axis: (..., view) -> (..., view, 3)."""
-    return jnp.stack(
-        jnp.broadcast_arrays(light.intensity, light.intensity * light.q, light.intensity * light.u),
-        axis=-1,
-    )
+    intensity, q, u = light
+    return jnp.stack(jnp.broadcast_arrays(intensity, intensity * q, intensity * u), axis=-1)
 
 
 def degree_of_linear_polarization(q: Array, u: Array) -> Array:
@@ -149,10 +147,7 @@ class LinearPolarization(Part):
 
 
 def mirror_light(
-    stack: Stack,
-    facet: MirrorFacet,
-    geometry: Geometry,
-    incident: tuple[Array, Array] | None,
+    stack: Stack, facet: MirrorFacet, geometry: Geometry, incident: tuple[Array, Array] | None
 ) -> Light:
     """Light that one facet mirrors to the viewer."""
     mean, power = stack.mirror(facet.cos_incidence, facet.sin_squared)

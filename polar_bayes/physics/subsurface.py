@@ -9,15 +9,7 @@ from jaxtyping import Array
 
 from polar_bayes.physics.geometry import Geometry, cos_degrees, per_ray, sin_degrees
 from polar_bayes.physics.half_space import CLEAREST, Ray, refract, scatter
-from polar_bayes.physics.part import (
-    Parameters,
-    Part,
-    Range,
-    Setting,
-    at_least,
-    quotient,
-    value_of,
-)
+from polar_bayes.physics.part import Parameters, Part, Range, Setting, at_least, quotient, value_of
 from polar_bayes.physics.phase_function import AbstractPhaseFunction, Isotropic
 from polar_bayes.physics.stokes import Light
 from polar_bayes.physics.surface import Interface, InternalReflection
@@ -154,13 +146,9 @@ class Depolarizer(AbstractSubsurface):
         view = _inside(geometry.view_zenith, n)
         light = _inside(rays.light_zenith, n[..., None])
         names = "refractive_index", *self.parameters
-        reflectance = self.phase_function.reflectance(
-            per_ray({name: parameters[name] for name in names}),
-            light,
-            per_ray(view),
-            rays.light_azimuth - rays.view_azimuth,
-            per_ray(escape),
-        )
+        body, view, escaping = per_ray(({name: parameters[name] for name in names}, view, escape))
+        azimuth = rays.light_azimuth - rays.view_azimuth
+        reflectance = self.phase_function.reflectance(body, light, view, azimuth, escaping)
         returned = jnp.sum(entering.intensity * reflectance, axis=-1) / (jnp.pi * n**2)
         leaving, kept = interface.exit(parameters, geometry), body_loss(absorption, escape)
         return Light(returned * leaving.intensity, kept * leaving.q, kept * leaving.u)
@@ -241,11 +229,8 @@ class TurbidMedium(AbstractSubsurface):
         view = _inside(geometry.view_zenith, n)
         light = _inside(rays.light_zenith, n[..., None])
         # The half space counts u from e_s towards e_s x l, the other way round.
-        incident = (
-            entering.intensity,
-            entering.intensity * entering.q,
-            -entering.intensity * entering.u,
-        )
+        power = entering.intensity
+        incident = power, power * entering.q, -power * entering.u
         scattered = scatter(
             light,
             per_ray(view),

@@ -17,7 +17,7 @@ from polar_bayes.physics.geometry import (
     per_ray,
     sin_degrees,
 )
-from polar_bayes.physics.illumination import AbstractIllumination, PointSource
+from polar_bayes.physics.illumination import AbstractIllumination, Beams, PointSource
 from polar_bayes.physics.microfacet import (
     AbstractMicrofacet,
     AbstractShadowing,
@@ -25,7 +25,6 @@ from polar_bayes.physics.microfacet import (
     Beckmann,
     IsotropicSlopes,
     SeparableShadowing,
-    SlopeEllipse,
 )
 from polar_bayes.physics.part import (
     Parameters,
@@ -56,14 +55,12 @@ class AbstractExit(Part):
     both_ways: ClassVar[bool] = False
 
     @abc.abstractmethod
-    def light(
-        self, facets: Microsurface, ellipse: SlopeEllipse, stack: Stack, geometry: Geometry
-    ) -> Light:
+    def light(self, facets: Microsurface, stack: Stack, geometry: Geometry) -> Light:
         """Transmittance towards the viewer, and the polarization that it gives.
 
         Args:
-            facets: How they tilt, which are seen, and how many stand for all.
-            ellipse: Their slopes in the frame of each viewer. Broadcasts with (..., view).
+            facets: How they tilt in the frame of each viewer, which are seen, and how many stand
+                for all.
             stack: What one facet is made of. Broadcasts with (..., view).
             geometry: Directions. Shape (..., view), degree.
 
@@ -77,9 +74,7 @@ class SmoothExit(AbstractExit):
     """Through a plane, whatever the roughness."""
 
     @override
-    def light(
-        self, facets: Microsurface, ellipse: SlopeEllipse, stack: Stack, geometry: Geometry
-    ) -> Light:
+    def light(self, facets: Microsurface, stack: Stack, geometry: Geometry) -> Light:
         return exit_through_plane(stack, geometry)
 
 
@@ -100,10 +95,8 @@ class RoughExit(AbstractExit):
         return (SmoothExit(),)
 
     @override
-    def light(
-        self, facets: Microsurface, ellipse: SlopeEllipse, stack: Stack, geometry: Geometry
-    ) -> Light:
-        sample = facets.sample(ellipse, geometry, seen)
+    def light(self, facets: Microsurface, stack: Stack, geometry: Geometry) -> Light:
+        sample = facets.sample(geometry, seen)
         # A barrier keeps facets from being found anew for each of their readers; see `facets`.
         sample = Facets(*jax.lax.optimization_barrier(tuple(sample)))
         passing = per_facet(stack).transmission(sample.cos_incidence, sample.sin_squared)
@@ -169,9 +162,7 @@ class AbstractSurface(Part):
         """
 
     @abc.abstractmethod
-    def beams(
-        self, parameters: Parameters, geometry: Geometry, stack: Stack
-    ) -> tuple[Geometry, Light]:
+    def beams(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Beams:
         """The same light ray by ray, for a body that asks where it comes from.
 
         Returns:
@@ -220,9 +211,7 @@ class SmoothSurface(AbstractSurface):
         return self.beam.entering(stack, geometry, parameters)
 
     @override
-    def beams(
-        self, parameters: Parameters, geometry: Geometry, stack: Stack
-    ) -> tuple[Geometry, Light]:
+    def beams(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Beams:
         return self.beam.beams(stack, geometry, parameters)
 
     @override
@@ -270,15 +259,15 @@ class RoughSurface(AbstractSurface):
     def parameters(self) -> tuple[str, ...]:
         return parameters_of(self.distribution, self.slopes, self.illumination)
 
-    @property
-    def facets(self) -> Microsurface:
+    def facets(self, parameters: Parameters, geometry: Geometry) -> Microsurface:
         """The surface as a population of facets."""
-        return Microsurface(self.distribution, self.shadowing, self.quadrature)
+        ellipse = self.slopes.ellipse(parameters, geometry)
+        return Microsurface(self.distribution, self.shadowing, self.quadrature, ellipse)
 
     @override
     def light(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
-        ellipse = self.slopes.ellipse(parameters, geometry)
-        return self.illumination.reflect(self.facets, ellipse, stack, geometry, parameters)
+        facets = self.facets(parameters, geometry)
+        return self.illumination.reflect(facets, stack, geometry, parameters)
 
     @override
     def entering(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
@@ -290,9 +279,7 @@ class RoughSurface(AbstractSurface):
         return Light(total, quotient(q, total), quotient(u, total))
 
     @override
-    def beams(
-        self, parameters: Parameters, geometry: Geometry, stack: Stack
-    ) -> tuple[Geometry, Light]:
+    def beams(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Beams:
         if not self.way_out.both_ways:
             return self.illumination.beams(stack, geometry, parameters)
         rays, irradiance = self.illumination.rays(geometry)
@@ -306,8 +293,7 @@ class RoughSurface(AbstractSurface):
 
     @override
     def exit(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
-        ellipse = self.slopes.ellipse(parameters, geometry)
-        return self.way_out.light(self.facets, ellipse, stack, geometry)
+        return self.way_out.light(self.facets(parameters, geometry), stack, geometry)
 
     @override
     def escape(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Array:
@@ -337,7 +323,7 @@ class Interface:
         """Light that passes into the body; see `AbstractSurface.entering`."""
         return self.surface.entering(parameters, geometry, self.stack)
 
-    def beams(self, parameters: Parameters, geometry: Geometry) -> tuple[Geometry, Light]:
+    def beams(self, parameters: Parameters, geometry: Geometry) -> Beams:
         """The same ray by ray; see `AbstractSurface.beams`."""
         return self.surface.beams(parameters, geometry, self.stack)
 

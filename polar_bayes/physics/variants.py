@@ -88,9 +88,8 @@ def find_effects(name: str, effects: Iterable[Effect], where: str) -> tuple[Effe
     )
     if not found:
         known = ", ".join(effect.name for effect in effects) or "none: nothing can be left out"
-        raise SceneError(
-            "the scene has no such effect", where=f"{where}={name!r}", hint=f"give one of {known}"
-        )
+        hint = f"give one of {known}"
+        raise SceneError("the scene has no such effect", where=f"{where}={name!r}", hint=hint)
     return found
 
 

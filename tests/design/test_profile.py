@@ -9,7 +9,7 @@ from design_lines import ASKED, NOISE, PRIOR, line, line_capture, precision_of, 
 
 import polar_bayes as pb
 from polar_bayes.design.profile import (
-    PRIOR_WEIGHT,
+    KINDS,
     likelihood_interval,
     log_density_parts,
 )
@@ -34,7 +34,7 @@ def closed_form(capture, theta, weight):
     return height - 0.5 * weight * (level**2 + theta**2) / PRIOR**2, level
 
 
-@each(("kind", "weight"), [("posterior", 1.0), ("likelihood", PRIOR_WEIGHT)])
+@each(("kind", "weight"), [("posterior", 1.0), ("likelihood", KINDS["likelihood"])])
 def test_the_profile_of_a_line_is_its_parabola(slope: xr.Dataset, kind: str, weight: float) -> None:
     theta = slope["value"].to_numpy()
     height, level = closed_form(line_capture(ZENITHS), theta, weight)

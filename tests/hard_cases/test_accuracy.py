@@ -409,7 +409,6 @@ def test_density_of_grooves(distribution: Beckmann | GGX, dtype: type) -> None:
     names, directions = unique_directions(dtype)
     geometry = geometry_of(directions)
     kind = type(distribution).__name__.lower()
-    surface = Microsurface(distribution, SeparableShadowing(), FacetQuadrature())
     tilt = mirror_facet(geometry).tan_squared_tilt
     for along, across, azimuth in (
         (0.3, 0.3, 25.0),
@@ -420,7 +419,8 @@ def test_density_of_grooves(distribution: Beckmann | GGX, dtype: type) -> None:
         values = {"roughness": along, "roughness_across": across, "roughness_azimuth": azimuth}
         parameters = {key: jnp.asarray(dtype(value)) for key, value in values.items()}
         ellipse = AnisotropicSlopes("roughness_azimuth").ellipse(parameters, geometry)
-        found = surface.density(ellipse, geometry, tilt)
+        surface = Microsurface(distribution, SeparableShadowing(), FacetQuadrature(), ellipse)
+        found = surface.density(geometry, tilt)
         assert found.dtype == dtype
         exact = [mp.mpf(float(parameters[key])) for key in values]
         peak = twin.groove_density(kind, mp.mpf(0), mp.mpf(0), *exact[:2])

@@ -52,9 +52,9 @@ def test_thirty_facets_are_enough(distribution: Beckmann | GGX) -> None:
 @each("zenith", [0.0, 30.0, 80.0])
 def test_no_facet_turns_its_back(zenith: float, side: float) -> None:
     view = jnp.array([side * zenith])
-    surface = Microsurface(Beckmann(), SeparableShadowing(), FacetQuadrature())
     ellipse = SlopeEllipse(jnp.array([0.5]), jnp.array([0.5]), None)
-    facets = surface.sample(ellipse, Geometry(view, view, view, view), seen)
+    surface = Microsurface(Beckmann(), SeparableShadowing(), FacetQuadrature(), ellipse)
+    facets = surface.sample(Geometry(view, view, view, view), seen)
     assert facets.weight.shape == (30, 1)
     assert np.all(facets.weight > 0.0)
     np.testing.assert_allclose(facets.cos_incidence**2 + facets.sin_squared, 1.0, rtol=1e-13)

@@ -15,14 +15,18 @@ from polar_bayes.physics.microfacet import (
     Beckmann,
     IsotropicSlopes,
     SeparableShadowing,
+    SlopeEllipse,
 )
 
 DISTRIBUTIONS = {"Beckmann": Beckmann(), "GGX": GGX()}
 named = each("name", DISTRIBUTIONS)
 
 
-def surface(name: str, quadrature: FacetQuadrature | None = None) -> Microsurface:
-    return Microsurface(DISTRIBUTIONS[name], SeparableShadowing(), quadrature or FacetQuadrature())
+def surface(
+    name: str, ellipse: SlopeEllipse, quadrature: FacetQuadrature | None = None
+) -> Microsurface:
+    rule = quadrature or FacetQuadrature()
+    return Microsurface(DISTRIBUTIONS[name], SeparableShadowing(), rule, ellipse)
 
 
 def roughness(along: float, across: float) -> dict:
@@ -50,7 +54,7 @@ def test_facets_cover_the_surface(name: str, along: float, across: float) -> Non
     geometry = towards(rays)
     ellipse = AnisotropicSlopes(35.0).ellipse(roughness(along, across), geometry)
     tilt = mirror_facet(geometry).tan_squared_tilt
-    density = surface(name).density(ellipse, geometry, tilt)
+    density = surface(name, ellipse).density(geometry, tilt)
     measure = np.sin(angle) * np.cos(angle) * 0.25 * np.pi * weight * 2.0 * np.pi / 300
     np.testing.assert_allclose(np.sum(density * measure), 1.0, rtol=1e-6)
 
@@ -67,7 +71,7 @@ def test_density_of_grooves_agrees_with_vectors(name: str) -> None:
     population = twin.Population(name, 0.4, 0.15, 35.0, steps=2)
     geometry = Geometry(*(jnp.asarray(x) for x in (*view, *light)))
     ellipse = AnisotropicSlopes(35.0).ellipse(roughness(0.4, 0.15), geometry)
-    found = surface(name).density(ellipse, geometry, mirror_facet(geometry).tan_squared_tilt)
+    found = surface(name, ellipse).density(geometry, mirror_facet(geometry).tan_squared_tilt)
     np.testing.assert_allclose(found, population.density(half), rtol=1e-9, atol=1e-30)
 
 
@@ -84,7 +88,7 @@ def test_visible_shares_of_grooves_agree_with_vectors(name: str) -> None:
     ellipse = AnisotropicSlopes(35.0).ellipse(roughness(0.6, 0.1), viewer)
     turn = np.deg2rad(azimuth + 20.0)
     tangent = np.tan(np.deg2rad(zenith))
-    found = surface(name).visible(ellipse, tangent * np.cos(turn), tangent * np.sin(turn))
+    found = surface(name, ellipse).visible(tangent * np.cos(turn), tangent * np.sin(turn))
     np.testing.assert_allclose(found, population.visible(rays), rtol=1e-12)
 
 
@@ -97,11 +101,10 @@ def test_seen_facets_show_the_area_of_the_plane(name: str, view: float) -> None:
         view_zenith=view, view_azimuth=10.0, light_zenith=0.0, light_azimuth=0.0
     )
     for slopes in (IsotropicSlopes(), AnisotropicSlopes(35.0)):
-        facets = surface(name, FacetQuadrature(40, 40))
-        ellipse = slopes.ellipse(roughness(0.4, 0.15), geometry)
-        sample = facets.sample(jax.tree.map(jnp.atleast_1d, ellipse), geometry, seen)
-        area = np.sum(sample.weight)
-        shares = facets.visible(ellipse, jnp.tan(jnp.deg2rad(view)), 0.0)
+        ellipse = jax.tree.map(jnp.atleast_1d, slopes.ellipse(roughness(0.4, 0.15), geometry))
+        facets = surface(name, ellipse, FacetQuadrature(40, 40))
+        area = np.sum(facets.sample(geometry, seen).weight)
+        shares = facets.visible(jnp.tan(jnp.deg2rad(view)), 0.0)
         bound = 6e-3 if name == "Beckmann" else 3e-4
         np.testing.assert_allclose(area * shares / np.cos(np.deg2rad(view)), 1.0, rtol=bound)
 
@@ -113,12 +116,10 @@ def test_equal_roughnesses_have_the_isotropic_density_and_share(name: str) -> No
     tilt = mirror_facet(geometry).tan_squared_tilt
     same = roughness(0.3, 0.3)
     one, other = (
-        slopes.ellipse(same, geometry) for slopes in (IsotropicSlopes(), AnisotropicSlopes(35.0))
-    )
-    facets = surface(name)
-    np.testing.assert_allclose(
-        facets.density(other, geometry, tilt), facets.density(one, geometry, tilt), rtol=1e-12
+        surface(name, slopes.ellipse(same, geometry))
+        for slopes in (IsotropicSlopes(), AnisotropicSlopes(35.0))
     )
     np.testing.assert_allclose(
-        facets.visible(other, 2.0, 1.0), facets.visible(one, 2.0, 1.0), rtol=1e-13
+        other.density(geometry, tilt), one.density(geometry, tilt), rtol=1e-12
     )
+    np.testing.assert_allclose(other.visible(2.0, 1.0), one.visible(2.0, 1.0), rtol=1e-13)
