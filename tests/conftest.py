@@ -5,12 +5,14 @@ it to (`polar_bayes.inference.compile.compiled`), which takes a third of the tim
 """
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")  # before JAX is imported
 
 import jax
 import pytest
+from matplotlib.figure import Figure
 
 jax.config.update("jax_enable_x64", True)
 
@@ -34,3 +36,11 @@ def measured() -> Path:
     if not folder.is_dir():
         pytest.skip("no measured data: set POLAR_BAYES_DATA to the folder that holds them")
     return folder
+
+
+@pytest.fixture(scope="module")
+def unpainted() -> Iterator[None]:
+    """Pictures of pages stay blank, which takes most of their time; others test what they show."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", lambda _, file, **__: file.write(b"<svg/>"))
+        yield

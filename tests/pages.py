@@ -3,6 +3,8 @@
 from html.parser import HTMLParser
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
+LINES = {"h1", "h2", "h3", "p", "tr", "li", "figcaption", "summary", "a", "caption", "dt", "pre"}
+EXTERNAL = {"script", "link", "iframe", "object", "embed", "base"}
 EVIL = '<script>alert(1)</script>"><img src=x onerror=alert(2)>'
 
 
@@ -16,21 +18,60 @@ class Page(HTMLParser):
         self.close()
 
     def handle_starttag(self, tag, attrs) -> None:
+        kind = dict(attrs).get("class")
         self.tags.append(tag)
         self.attributes += [(tag, name, value or "") for name, value in attrs]
         if tag not in VOID:
             self.open.append(tag)
+        if tag in LINES:
+            self.texts.append("\n")
+        elif tag in ("td", "th"):
+            self.texts.append(f"| <{kind}>" if kind else "|")
+        elif tag == "section" and kind:
+            self.texts.append(f"\n<{kind}>")
+        elif tag == "img":
+            self.texts.append(f"\n[{dict(attrs).get('alt')}]")
 
     def handle_endtag(self, tag) -> None:
         assert self.open.pop() == tag
 
     def handle_data(self, data) -> None:
         if "style" not in self.open:
-            self.texts.append(data)
+            self.texts.append(" ".join(data.split()))
+
+    @property
+    def lines(self) -> list[str]:
+        """What a reader reads: a line for each paragraph, row, link or picture."""
+        lines = " ".join(self.texts).split("\n")
+        return [line for line in (" ".join(line.split()) for line in lines) if line]
 
     @property
     def text(self) -> str:
-        return " ".join(" ".join(self.texts).split())
+        return " ".join(" ".join(self.lines).replace("|", " ").split())
 
     def values(self, name: str) -> list[str]:
         return [value for _, attribute, value in self.attributes if attribute == name]
+
+
+def faults_of(page: Page) -> list[str]:
+    """What no page may have: other files, scripts, dead anchors, pictures without words."""
+    ids, boxes = page.values("id"), [x for x in page.values("class") if x.startswith("scroll")]
+    led_to = {value[1:] for value in page.values("href") if value.startswith("#")}
+    led_to |= set(page.values("aria-labelledby"))
+    found = {
+        "tags left open": page.open,
+        "tags that load or run": EXTERNAL & set(page.tags),
+        "handlers": [name for _, name, _ in page.attributes if name.startswith("on")],
+        "attributes": page.values("srcset") + page.values("action") + page.values("style"),
+        "sources": [x for x in page.values("src") if not x.startswith("data:image/svg+xml;base64")],
+        "links": [x for x in page.values("href") if not x.startswith(("#", "data:text/csv;"))],
+        "names given twice": [name for name in set(ids) if ids.count(name) > 1],
+        "dead anchors": led_to - set(ids),
+        "pictures without words": [
+            x for tag, name, x in page.attributes if name == "alt" and not x
+        ],
+        "pictures that say nothing": page.tags.count("img") != len(page.values("alt")),
+        "tables in no box": page.tags.count("table") > len(boxes),
+        "no policy": "default-src 'none'" not in " ".join(page.values("content")),
+    }
+    return [f"{what}: {which}" for what, which in found.items() if which]

@@ -1,11 +1,9 @@
 """The way out of the body: through a plane, through facets, and the one as the other's limit."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import each
-from textbook import mirror_and_body
 
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import PointSource
@@ -32,23 +30,6 @@ MATERIAL = {"roughness": jnp.array([0.3]), "roughness_across": jnp.array([0.1])}
 BARE = Stack(jnp.array([1.5]))
 COATED = Stack(jnp.array([1.5]), (Layer(jnp.array([1.4]), jnp.array([0.2])),))
 stacks = each("stack", [BARE, COATED], ids=["bare", "coated"])
-
-
-def test_through_a_plane_it_is_fresnels_law() -> None:
-    leaving = SmoothSurface().exit(MATERIAL, VIEWS, BARE)
-    s, p, _ = mirror_and_body(np.array(1.5), np.deg2rad(ZENITHS))
-    np.testing.assert_allclose(leaving.intensity, 1.0 - 0.5 * (s + p), rtol=1e-13)
-    np.testing.assert_allclose(leaving.q, -(s - p) / (2.0 - s - p), rtol=1e-12, atol=1e-15)
-    np.testing.assert_array_equal(leaving.u, 0.0)
-
-
-@pytest.mark.thorough
-@stacks
-def test_a_smooth_way_out_of_a_rough_surface_is_that_of_a_plane(stack: Stack) -> None:
-    plane = SmoothSurface().exit(MATERIAL, VIEWS, stack)
-    for slopes in (RoughSurface().slopes, AnisotropicSlopes(30.0)):
-        rough = RoughSurface(slopes=slopes, way_out=SmoothExit()).exit(MATERIAL, VIEWS, stack)
-        jax.tree.map(np.testing.assert_array_equal, rough, plane)
 
 
 @pytest.mark.thorough
@@ -95,12 +76,6 @@ def test_a_scene_takes_its_way_out_from_the_surface() -> None:
     )
     np.testing.assert_allclose(smooth.q, plane.q, rtol=1e-12, atol=1e-16)
     assert np.all(np.abs(rough.q[1:]) < np.abs(smooth.q[1:]))
-
-
-@pytest.mark.thorough
-def test_only_the_rough_way_out_has_something_simpler() -> None:
-    assert RoughExit().simpler() == (SmoothExit(),)
-    assert SmoothExit().simpler() == ()
 
 
 # --- what may pass both ways: energy and reciprocity ---------------------------------------------

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from physics.test_half_space import hemisphere, read, refracted, transmittance, under_beam
 
-import polar_bayes as pb
 from polar_bayes.physics.half_space import CLEAREST, Ray
 from polar_bayes.physics.phase_function import HenyeyGreenstein, Isotropic
 from polar_bayes.physics.stack import Stack
@@ -267,10 +266,3 @@ def test_a_black_body_scatters_once(light: float, view: float, azimuth: float, g
     material = {"absorption": jnp.asarray(1e9 / (1.0 - g)), "refractive_index": jnp.asarray(1.5)}
     found = HenyeyGreenstein(g).reflectance(material, beam, seen, azimuth, jnp.asarray(0.5))
     np.testing.assert_allclose(found, once, rtol=1e-6)
-
-
-def test_an_anisotropy_is_a_number_below_nine_tenths_or_a_name() -> None:
-    with pytest.raises(pb.SceneError, match=r"HenyeyGreenstein: anisotropy: 0.95 is neither"):
-        HenyeyGreenstein(0.95)
-    body = pb.Depolarizer(phase_function=HenyeyGreenstein("anisotropy"))
-    assert body.parameters == ("absorption", "anisotropy")

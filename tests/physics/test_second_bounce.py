@@ -7,14 +7,12 @@ import pytest
 import vector_optics as twin
 from cases import each
 
-from polar_bayes.errors import SceneError
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
-from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
+from polar_bayes.physics.illumination import PointSource, UniformSky
 from polar_bayes.physics.microfacet import GGX, AnisotropicSlopes, Beckmann
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.second_bounce import TwoBounceSurface
-from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.surface import RoughSurface
 
 MANY = FacetQuadrature(10, 8)
@@ -161,15 +159,3 @@ def test_equal_slopes_of_grooves_are_isotropic() -> None:
     grooves = second_bounce(parameters, geometry, slopes=AnisotropicSlopes(35.0), **facets)
     alike = second_bounce(parameters, geometry, **facets)
     np.testing.assert_allclose(grooves, alike, rtol=0.05, atol=1e-4)
-
-
-def test_a_surface_of_one_bounce_is_simpler() -> None:
-    surface = TwoBounceSurface(GGX(), quadrature=MANY)
-    assert surface.simpler() == (RoughSurface(GGX(), quadrature=MANY),)
-    assert Scene(surface).parameters == Scene(RoughSurface(GGX())).parameters
-
-
-@each("light", [Disc(5.0), PointSource(LinearPolarization())])
-def test_other_light_is_refused(light) -> None:
-    with pytest.raises(SceneError, match="has no second bounce; give PointSource"):
-        TwoBounceSurface(illumination=light)

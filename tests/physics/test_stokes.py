@@ -34,11 +34,6 @@ def test_unpolarized_light_has_finite_derivatives(dtype: type) -> None:
     np.testing.assert_allclose(jax.hessian(length)(zero), np.eye(2) / TIP, rtol=1e-5)
 
 
-@pytest.mark.thorough
-def test_above_the_tip_the_length_is_exact() -> None:
-    np.testing.assert_allclose(degree_of_linear_polarization(3e-7, 4e-7), 5e-7, rtol=1e-10)
-
-
 @each(
     ("q", "u", "angle"),
     [(0.3, 0.0, 0.0), (0.0, 0.3, 45.0), (-0.3, 0.0, 90.0), (0.0, -0.3, -45.0), (0.0, 0.0, 0.0)],

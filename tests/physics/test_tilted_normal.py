@@ -12,7 +12,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from polar_bayes.errors import SceneError
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import PointSource, UniformSky
@@ -26,11 +25,10 @@ from polar_bayes.physics.instrument import (
 )
 from polar_bayes.physics.microfacet import GGX, AnisotropicSlopes, Beckmann
 from polar_bayes.physics.mixing import StokesMixing
-from polar_bayes.physics.scene import MATERIAL_PARAMETERS, SCENES, Scene
+from polar_bayes.physics.scene import SCENES, Scene
 from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.subsurface import Lambertian, TurbidMedium
 from polar_bayes.physics.surface import RoughSurface, SmoothExit, SmoothSurface
-from polar_bayes.physics.variants import effects_of
 
 RUN = settings(deadline=None, max_examples=60, derandomize=True)
 direction = st.tuples(st.floats(0.0, 75.0), st.floats(-360.0, 360.0))
@@ -331,21 +329,6 @@ def test_the_instrument_acts_on_the_stated_angles() -> None:
 
 
 @pytest.mark.thorough
-def test_the_tilts_are_of_the_material() -> None:
-    scene = leaning(SCENES["camera"])
-    assert {"normal_tilt_x", "normal_tilt_y"} <= set(MATERIAL_PARAMETERS)
-    assert scene.parameters == (
-        "roughness",
-        "subsurface_fraction",
-        "refractive_index",
-        "normal_tilt_x",
-        "normal_tilt_y",
-        "dolp_gain",
-    )
-    assert {"normal_tilt_x", "normal_tilt_y"} <= set(scene.optical_parameters)
-
-
-@pytest.mark.thorough
 def test_every_patch_leans_by_itself() -> None:
     scene = leaning(SCENES["camera"])
     views = Geometry.from_degrees(
@@ -369,29 +352,6 @@ def test_a_known_lean_is_no_parameter() -> None:
         predict(scene, tilted((4.0, -2.0)), views) for scene in (known, leaning(SCENES["camera"]))
     )
     np.testing.assert_allclose(found["q"], expected["q"], rtol=1e-14)
-
-
-@pytest.mark.thorough
-def test_the_ledger_of_effects_finds_it() -> None:
-    found = {effect.name: effect for effect in effects_of(leaning(SCENES["camera"]))}
-    assert found["TiltedNormal"].path == "normal"
-    assert found["TiltedNormal"].apply(leaning(SCENES["camera"])) == SCENES["camera"]
-
-
-@each(
-    ("make", "message"),
-    [
-        (lambda: TiltedNormal(tilt_x=61.0), "TiltedNormal: tilt_x: 61.0 is neither a number from"),
-        (lambda: TiltedNormal(tilt_y="two degrees"), "TiltedNormal: tilt_y: 'two degrees' is nei"),
-        (
-            lambda: Scene(SmoothSurface(), normal=5.0),
-            r"normal: 5.0 is no such part; give TiltedNormal\(\) or None",
-        ),
-    ],
-)
-def test_settings_that_make_no_sense_are_refused(make: object, message: str) -> None:
-    with pytest.raises(SceneError, match=message):
-        make()
 
 
 # --- what a lean does to the material -----------------------------------------------------------

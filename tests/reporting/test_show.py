@@ -7,6 +7,8 @@ from synthetic_results import make_result, replace
 import polar_bayes as pb
 from polar_bayes.errors import FitError
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
 
 
