@@ -65,7 +65,7 @@ def test_a_finished_map_is_resumed_with_status_0(
     monkeypatch.setattr(store, "fit_block", lambda block, plan: blank(block, plan).load())
     capture, out = tmp_path / "plates.zarr", tmp_path / "map.zarr"
     plate_image(3, 4).to_zarr(capture, consolidated=False)
-    words = ["map", str(capture), "--out", str(out), "--scene", "camera"]
+    words = ["map", str(capture), "--out", str(out), "--scene", "picture"]
     for more in ([], ["--resume"]):
         assert main([*words, *more]) == 0
         assert capsys.readouterr().out == f"{out}: 12 not fitted\n"

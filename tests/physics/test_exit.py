@@ -1,5 +1,6 @@
 """The way out of the body: through a plane, through facets, and the one as the other's limit."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from polar_bayes.physics.surface import (
     SmoothSurface,
 )
 
+light_of = jax.jit(Scene.light, static_argnums=0)
 ZENITHS = jnp.array([0.0, 30.0, 60.0, 80.0])
 VIEWS = Geometry(ZENITHS, jnp.full(4, 20.0), ZENITHS, jnp.full(4, 200.0))
 MATERIAL = {"roughness": jnp.array([0.3]), "roughness_across": jnp.array([0.1])}
@@ -99,7 +101,7 @@ def returned(way_out: AbstractExit, light_zenith: float, roughness: float) -> fl
     )
     # Half surface and half body, twice: both together.
     material = {"roughness": roughness, "refractive_index": 1.5, "subsurface_fraction": 0.5}
-    light = body(way_out).light(material, geometry).intensity.reshape(40, 40)
+    light = light_of(body(way_out), material, geometry).intensity.reshape(40, 40)
     sent = np.sum(light * (0.5 * weight * cosine)[:, None]) * 2.0 * np.pi / 40.0
     return float(2.0 * sent / np.cos(np.deg2rad(light_zenith)))
 
