@@ -5,7 +5,7 @@
 The per-material model of one color, 40 views, NUTS with the default settings, each level of
 optimization in a process of its own without a cache of compiled programs: seconds of the first
 `pb.fit` and the least of three further ones, of other readings. "all" is what XLA does unasked;
-`polar_bayes.inference.compile.COMPILER_OPTIONS` is what fits ask for.
+`polar_bayes.numerics.compile.COMPILER_OPTIONS` is what fits ask for.
 """
 
 import os
@@ -18,7 +18,7 @@ import jax
 from one_material import SCENE
 
 import polar_bayes as pb
-from polar_bayes.inference import compile
+from polar_bayes.numerics import compile
 
 PROTOCOL = pb.simulation.Protocol(views=40, wavelengths=())
 LEVELS = ("all", "2", "1", "0")

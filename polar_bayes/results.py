@@ -147,7 +147,7 @@ KINDS = (
         "design.next_views:next_views_sentences",
     ),
     _describing(
-        "effects", "kept", "effects.choose:ledger_table", "effects.choose:ledger_sentences"
+        "effects", "kept", "scenes.effects:ledger_table", "scenes.effects:ledger_sentences"
     ),
     Kind(
         "several fits",

@@ -19,6 +19,7 @@ from jaxtyping import Array
 
 from polar_bayes.capture.schema import Interval, validate
 from polar_bayes.errors import CaptureError, FitError, SceneError
+from polar_bayes.numerics.compile import compiled
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink, noise_parameters
 from polar_bayes.physics.geometry import Geometry
@@ -353,8 +354,11 @@ def simulate(
     truth = checked_parameters(setup.scene, material, wavelengths, parameters or {})
     levels = checked_noise(links, NOISE, noise or {})
     image = image_shape(truth, levels)
+    given = protocol.angles(), wavelengths, truth, levels, np.uint32(seed)
     with jax.enable_x64(True):
-        recorded = _record(setup.scene, links, _layout(protocol, links, image), truth, levels, seed)
+        record = compiled(_record, static_argnames=("scene", "links", "image"))
+        found = record(setup.scene, tuple(links.items()), image, *given)
+    recorded = {key: np.asarray(value) for key, value in found.items()}
     name = name or (preset if isinstance(preset, str) else "simulated")
     attributes: dict[str, str | int] = {"name": name, "seed": seed}
     if (set_up := setup_name(setup)) != "custom" and not isinstance(scene, Scene):
@@ -376,29 +380,33 @@ def _checked_links(links: Mapping[str, AbstractLink]) -> dict[str, AbstractLink]
 
 def _record(
     scene: Scene,
-    links: Mapping[str, AbstractLink],
-    layout: Observations,
-    truth: Mapping[str, np.ndarray],
-    noise: Mapping[str, np.ndarray | None],
-    seed: int,
-) -> dict[str, np.ndarray]:
-    """Readings with the dims of `layout`: intensity first, since noise depends on it."""
+    links: tuple[tuple[str, AbstractLink], ...],
+    image: tuple[int, ...],
+    angles: Mapping[str, Array],
+    wavelengths: Array,
+    truth: Mapping[str, Array],
+    noise: Mapping[str, Array | None],
+    seed: Array,
+) -> dict[str, Array]:
+    """Readings with the dims of the layout: intensity first, since noise depends on it."""
+    link_of = dict(links)
+    layout = _layout(angles, wavelengths, link_of, image)
     key_intensity, key_rest = jax.random.split(jax.random.key(seed))
     axes = len(layout.shape)
-    parameters = {name: jnp.asarray(_align_image(x, axes - 1)) for name, x in truth.items()}
+    parameters = {name: _align_image(x, axes - 1) for name, x in truth.items()}
     prediction = scene.predict(parameters, layout.geometry)
     prediction = {n: jnp.broadcast_to(x, layout.shape) for n, x in prediction.items()}
     light = prediction["intensity"]
     brightest = jnp.max(light) / LARGEST_CONTRAST
     exposure = BRIGHT_LEVEL / jnp.maximum(jnp.quantile(light, BRIGHT_QUANTILE), brightest)
     levels = {
-        name: exposure if level is None else jnp.asarray(_align_image(level, axes))
+        name: exposure if level is None else _align_image(level, axes)
         for name, level in noise.items()
     }
     recorded: dict[str, Array] = {}
     data = layout
-    if "intensity" in links:
-        link = links["intensity"]
+    if "intensity" in link_of:
+        link = link_of["intensity"]
         intensity = link.distribution("intensity", prediction, layout, levels).sample(key_intensity)
         intensity = jnp.clip(intensity, 0.0, FULL_SCALE)
         recorded["intensity"] = intensity
@@ -408,16 +416,15 @@ def _record(
             brightness=jnp.clip(intensity / FULL_SCALE, 0.0, 1.0),
             saturated=recorded["saturated"],
         )
-    for name, key in zip(links, jax.random.split(key_rest, len(links)), strict=True):
+    for (name, link), key in zip(links, jax.random.split(key_rest, len(links)), strict=True):
         if name != "intensity":
-            recorded[name] = links[name].distribution(name, prediction, data, levels).sample(key)
+            recorded[name] = link.distribution(name, prediction, data, levels).sample(key)
     recorded |= _physical(recorded)
-    for name in (name for name, link in links.items() if link.reads_errors):
-        recorded[f"{name}_error"] = layout.errors[name]
-    return {name: np.asarray(value) for name, value in recorded.items()}
+    errors = {f"{name}_error": layout.errors[name] for name, link in links if link.reads_errors}
+    return recorded | errors
 
 
-def _align_image(value: np.ndarray, axes: int) -> np.ndarray:
+def _align_image(value: Array, axes: int) -> Array:
     """An image with trailing axes of length 1, so that it has `axes` axes; others unchanged."""
     return value.reshape(value.shape + (1,) * (axes - 2)) if value.ndim == 2 else value
 
@@ -433,17 +440,19 @@ def _physical(recorded: Mapping[str, Array]) -> dict[str, Array]:
 
 
 def _layout(
-    protocol: Protocol, links: Mapping[str, AbstractLink], image: tuple[int, ...]
+    angles: Mapping[str, Array],
+    wavelengths: Array,
+    links: Mapping[str, AbstractLink],
+    image: tuple[int, ...],
 ) -> Observations:
     """The layout of the capture before anything was recorded."""
-    dims: tuple[tuple[str, int], ...] = (("view", protocol.views),)
-    if protocol.wavelengths:
-        dims = (("wavelength", len(protocol.wavelengths)), *dims)
+    dims: tuple[tuple[str, int], ...] = (("view", len(angles["view_zenith"])),)
+    if len(wavelengths):
+        dims = (("wavelength", len(wavelengths)), *dims)
     if image:
         dims = (*zip(IMAGE, image, strict=True), *dims)
     shape = tuple(length for _, length in dims)
-    angles = {name: jnp.asarray(angle) for name, angle in protocol.angles().items()}
-    colors = jnp.asarray(protocol.wavelengths)[:, None] if protocol.wavelengths else None
+    colors = wavelengths[:, None] if len(wavelengths) else None
     return Observations(
         geometry=Geometry.from_degrees(**angles, wavelength=colors),
         readings={},

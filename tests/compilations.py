@@ -27,14 +27,14 @@ def compiled_fast(
 ) -> Iterator[None]:
     """What a fixture yields from where programs are compiled more often than they run."""
     numbers = {
-        "initialization.STARTS": starts,
-        "hierarchical_reparam.MOST_STARTS": 4,
-        "hierarchical_reparam.TYPICAL_DRAWS": typical,
-        "fitting.PRIOR_DRAWS": draws,
-        "program.BLOCK": block,
+        "inference.initialization.STARTS": starts,
+        "inference.hierarchical_reparam.MOST_STARTS": 4,
+        "inference.hierarchical_reparam.TYPICAL_DRAWS": typical,
+        "scenes.fit_request.PRIOR_DRAWS": draws,
+        "inference.program.BLOCK": block,
     }
     for name, number in numbers.items():
-        monkeypatch.setattr(f"polar_bayes.inference.{name}", number)
+        monkeypatch.setattr(f"polar_bayes.{name}", number)
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)

@@ -115,7 +115,7 @@ import polar_bayes as pb
 pb.Geometry
 assert "jax" in sys.modules and "TF_CPP_MIN_LOG_LEVEL" not in os.environ
 import jax
-from polar_bayes.inference.compile import compiled
+from polar_bayes.numerics.compile import compiled
 assert jax.config.jax_compilation_cache_dir is None
 jax.jit(lambda x: x + 2.0)(1.0)
 compiled(lambda x: x + 1.0)(1.0)

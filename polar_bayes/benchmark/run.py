@@ -25,12 +25,13 @@ from jaxtyping import Array, Float
 
 from polar_bayes.diagnostics.parameters import scalars
 from polar_bayes.errors import FitError, PolarBayesError
-from polar_bayes.inference.compile import LRUCache, cache_key
+from polar_bayes.inference.cache_key import cache_key
 from polar_bayes.inference.problem import Problem, make_problem
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import posterior_of
 from polar_bayes.interrupts import on_interrupt
 from polar_bayes.methods.method import AbstractMethod, PosteriorDraws
+from polar_bayes.numerics.compile import LRUCache
 from polar_bayes.numerics.psis import CHAINS, numpy_generator
 from polar_bayes.paths import temporary_folder
 from polar_bayes.physics.facets import FacetQuadrature

@@ -24,9 +24,9 @@ from numpyro import handlers
 
 from polar_bayes.calibration.scores import randomized_pit
 from polar_bayes.inference.batching import ObservationBatch, batched
-from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import SMALL_BATCH, CompiledModel
 from polar_bayes.inference.program import Program, Values
+from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.numerics.psis import draws_at, smooth
 from polar_bayes.observation.data import Observations
 

@@ -22,7 +22,6 @@ from polar_bayes.calibration.predictive import Arrays, PredictivePit, unranked_r
 from polar_bayes.calibration.scores import PitCrps
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batching import ObservationBatch
-from polar_bayes.inference.compile import TRACING_LOCK, JitOnce, LRUCache
 from polar_bayes.inference.compiled_model import CompiledModel, compile_layout
 from polar_bayes.inference.problem import observe_request
 from polar_bayes.inference.problem_batch import Outcome, empty_outcome, problem_batch
@@ -41,6 +40,7 @@ from polar_bayes.maps.blocks import (
     written,
 )
 from polar_bayes.methods.method import AbstractBatchMethod
+from polar_bayes.numerics.compile import TRACING_LOCK, JitOnce, LRUCache
 from polar_bayes.numerics.psis import Marginals
 from polar_bayes.observation.data import Observations
 from polar_bayes.paths import TEMPORARY_PREFIX, replace_file, temporary_folder

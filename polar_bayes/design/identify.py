@@ -25,8 +25,8 @@ from polar_bayes.design.setup import (
     posterior_modes,
     provenance_attrs,
 )
-from polar_bayes.inference.compile import compiled
 from polar_bayes.inference.request import resolve
+from polar_bayes.numerics.compile import compiled
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.part import notation

@@ -49,12 +49,12 @@ from polar_bayes.design.setup import (
     provenance_attrs,
 )
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compile import compiled
 from polar_bayes.inference.compiled_model import compile_model
 from polar_bayes.inference.problem import observe_request
 from polar_bayes.inference.program import from_prior
 from polar_bayes.inference.request import resolve
 from polar_bayes.inference.result import capture_of
+from polar_bayes.numerics.compile import compiled
 from polar_bayes.observation.data import ANGLES, Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene

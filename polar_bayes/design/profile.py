@@ -33,10 +33,10 @@ from polar_bayes.design.setup import (
 )
 from polar_bayes.diagnostics.parameters import Coordinate, label_coordinates, label_scalars
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.program import Program
 from polar_bayes.inference.request import resolve
+from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.numerics.optimize import (
     Modes,
     NumpyPotential,

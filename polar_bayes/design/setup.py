@@ -13,7 +13,6 @@ from jaxtyping import Array, Float, Int
 
 from polar_bayes.diagnostics.parameters import Scalar, label_scalars
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compile import compiled
 from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.initialization import STARTS
@@ -21,6 +20,7 @@ from polar_bayes.inference.problem import compile_request
 from polar_bayes.inference.program import Program, from_prior
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import PROVENANCE
+from polar_bayes.numerics.compile import compiled
 from polar_bayes.numerics.optimize import Modes, NumpyPotential, ValueAndGradient, find_modes
 from polar_bayes.observation.data import Observations
 from polar_bayes.progress import Progress, no_progress

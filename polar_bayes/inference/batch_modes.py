@@ -15,10 +15,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from polar_bayes.inference.batching import ObservationBatch, batched, batched_lanes
-from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import BATCH, CompiledModel
 from polar_bayes.inference.scoring import exact_derivatives, scoring_derivatives
 from polar_bayes.numerics.batches import map_batches, put_rows, take_rows
+from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.numerics.levenberg_marquardt import (
     LMState,
     NormalApproximation,

@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Array
 
-from polar_bayes.inference.compile import JitOnce
+from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.observation.data import Observations
 from polar_bayes.physics.geometry import Geometry
 

@@ -19,12 +19,13 @@ from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
 from polar_bayes.inference.batching import ObservationBatch
-from polar_bayes.inference.compile import TRACING_LOCK, JitOnce, LRUCache, cache_key, layout_of
+from polar_bayes.inference.cache_key import cache_key, layout_of
 from polar_bayes.inference.initialization import AbstractInitializer, make_initializer
 from polar_bayes.inference.program import Model, Program, compile_program, from_prior
 from polar_bayes.inference.request import Request, bind_model
 from polar_bayes.inference.result import dims_of, shape_of
 from polar_bayes.numerics.batches import batches, map_batches
+from polar_bayes.numerics.compile import TRACING_LOCK, JitOnce, LRUCache
 from polar_bayes.observation.data import Observations
 
 BATCH = 128

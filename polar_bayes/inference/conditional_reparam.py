@@ -32,8 +32,8 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
-from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.program import Program
+from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.observation.data import Observations
 
 MOST_COEFFICIENTS = 16

@@ -42,8 +42,8 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.program import Model, Program, compile_program, from_prior
+from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.numerics.optimize import (
     Modes,
     NumpyPotential,

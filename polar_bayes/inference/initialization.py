@@ -21,7 +21,6 @@ from numpyro import handlers
 from numpyro.infer.autoguide import AutoLaplaceApproximation
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.conditional_reparam import ConditionalReparam, find_coefficients
 from polar_bayes.inference.hierarchical_reparam import (
     FittedReparam,
@@ -32,13 +31,15 @@ from polar_bayes.inference.hierarchical_reparam import (
     fit_reparam,
 )
 from polar_bayes.inference.program import (
-    KEYS,
+    BLOCK,
     Model,
     Program,
     begin_from_prior,
+    first_key,
     from_prior,
     in_blocks,
 )
+from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.numerics.optimize import (
     Modes,
     NumpyPotential,
@@ -194,7 +195,7 @@ class JointInit(AbstractInit):
             lambda z: program.log_density(z, self.data),
             self.modes,
             np.arange(program.size),
-            finite_sd(from_prior(program, jax.random.key(0), KEYS, self.data)),
+            finite_sd(from_prior(program, first_key(), BLOCK, self.data)),
         )
         if reparam is None:
             return own
@@ -390,7 +391,7 @@ class JointInitializer(AbstractInitializer):
         if reparam is None:
             return target(self.program.potential_jit, data)
         given = reparam.inputs(starts[0], metric, data)
-        reparam.value_and_gradient.begin(jnp.asarray(starts[0]), given)
+        reparam.value_and_gradient.begin(starts[0], given)
         return target(reparam.potential_jit, given)
 
 

@@ -15,17 +15,14 @@ import pandas as pd
 from jaxtyping import Array, ArrayLike, Float
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compile import TRACING_LOCK
 from polar_bayes.inference.compiled_model import CompiledModel, compile_model
 from polar_bayes.inference.initialization import AbstractInit
-from polar_bayes.inference.program import Draw, Program, Values, in_blocks
+from polar_bayes.inference.program import Draw, Program, Values, in_blocks, keys_of_draws
 from polar_bayes.inference.request import Request
+from polar_bayes.numerics.compile import TRACING_LOCK
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.priors import RANGES, describe_prior, support_bounds
 from polar_bayes.progress import Progress, no_progress
-
-KEYS = 1 << 15
-"""Random keys are split in multiples of this number: one compiled program serves any number."""
 
 
 @dataclasses.dataclass
@@ -198,11 +195,8 @@ class Problem:
             Arrays of shape (chain, draw, ...), by group and name.
         """
         flat = z.reshape(-1, self.program.size).astype(self.dtype)
-        # The key of a draw depends on its index alone, so a round number serves any number of them.
-        every = jax.random.split(key, KEYS * -(-len(flat) // KEYS))
-        keys = np.asarray(jax.random.key_data(every))
-
-        found = in_blocks(self.program.described, (keys[: len(flat)], flat), self.data)
+        keys = keys_of_draws(key, len(flat))
+        found = in_blocks(self.program.described, (keys, np.ones(len(flat), bool), flat), self.data)
         return jax.tree.map(lambda x: x.reshape(*z.shape[:2], *x.shape[1:]), found)
 
 

@@ -22,8 +22,8 @@ from numpyro.infer.util import compute_log_probs
 from numpyro.primitives import Messenger
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compile import JitOnce
 from polar_bayes.numerics.batches import map_batches
+from polar_bayes.numerics.compile import JitOnce, compiled
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
@@ -96,8 +96,15 @@ class Program:
     @functools.cached_property
     def positions(self) -> dict[str, np.ndarray]:
         """Indices of the unconstrained coordinates, by site."""
-        found = self.unravel(jnp.arange(float(self.size)))
-        return {name: np.asarray(index).astype(int) for name, index in found.items()}
+        found, begin = {}, 0
+        for name, like in jax.eval_shape(self.unravel, self._vector).items():
+            end = begin + math.prod(like.shape)
+            found[name], begin = np.arange(begin, end).reshape(like.shape), end
+        return found
+
+    @property
+    def _vector(self) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((self.size,), jnp.float32)
 
     def _constrain(self, sites: dict[str, Array]) -> dict[str, Array]:
         return {name: dist.biject_to(self.supports[name])(x) for name, x in sites.items()}
@@ -137,13 +144,13 @@ class Program:
     def free(self, data: Observations) -> Observations:
         """The data with room for what is held, and nothing held; programs are those of `hold`."""
         dtype = data.brightness.dtype
-        held = {n: jnp.full(x.shape, jnp.nan, dtype) for n, x in self._latent_shapes.items()}
-        return dataclasses.replace(data, held=held)
+        held = {n: np.full(x.shape, np.nan, dtype) for n, x in self._latent_shapes.items()}
+        return dataclasses.replace(data, held=jax.device_put(held))
 
     @functools.cached_property
     def _latent_shapes(self) -> dict[str, jax.ShapeDtypeStruct]:
         """Of the latent sites in their supports."""
-        return jax.eval_shape(self.constrain, jax.ShapeDtypeStruct((self.size,), jnp.float32))
+        return jax.eval_shape(self.constrain, self._vector)
 
     def trace(self, z: Float[Array, " size"], data: Observations) -> dict[str, dict]:
         """The sites of the model at an unconstrained vector."""
@@ -174,8 +181,14 @@ class Program:
         trace = _trace(self.model, key, data)
         return self.unconstrain({name: trace[name]["value"] for name in self.supports})
 
-    def describe(self, key: Array, z: Float[Array, " size"], data: Observations) -> Draw:
-        """Parameters, densities and predicted readings of one draw."""
+    def describe(
+        self,
+        key: Array,
+        z: Float[Array, " size"],
+        data: Observations,
+        predicts: Array | bool = True,
+    ) -> Draw:
+        """Parameters, densities and predicted readings of one draw, 0 where it predicts none."""
         seeded = handlers.seed(self.model, key)
         terms, trace = self._log_terms(seeded, self.unravel(z), data)
         keys = dict(zip(self.observed, jax.random.split(key, len(self.observed)), strict=True))
@@ -194,7 +207,15 @@ class Program:
                 for n in self.supports
                 if n not in self.auxiliary
             },
-            predictive={name: site["fn"].sample(keys[name]) for name, site in readings.items()},
+            predictive={
+                name: jax.lax.cond(
+                    predicts,
+                    lambda key, site=site: site["fn"].sample(key),
+                    lambda _, site=site: jnp.zeros_like(site["value"]),
+                    keys[name],
+                )
+                for name, site in readings.items()
+            },
             log_density=_total(terms, data),
         )
 
@@ -234,25 +255,26 @@ class Program:
     def described(self) -> JitOnce:
         """`describe` of many draws, compiled; keys as the data that they hold, (draw, ...)."""
 
-        def describe(keys: Array, z: Array, data: Observations) -> Draw:
-            wrapped = jax.random.wrap_key_data(keys)
-            return jax.lax.map(lambda kz: self.describe(kz[0], kz[1], data), (wrapped, z))
+        def describe(keys: Array, predicts: Array, z: Array, data: Observations) -> Draw:
+            rows = jax.random.wrap_key_data(keys), predicts, z
+            return jax.lax.map(lambda row: self.describe(row[0], row[2], data, row[1]), rows)
 
         return JitOnce(describe)
 
     def begin_described(self, data: Observations) -> None:
         """Begin to compile the description of a block of draws."""
-        keys = jax.random.key_data(jax.random.key(0))
         self.described.begin(
-            jax.ShapeDtypeStruct((BLOCK, *keys.shape), keys.dtype),
+            _keys_like(BLOCK),
+            jax.ShapeDtypeStruct((BLOCK,), bool),
             jax.ShapeDtypeStruct((BLOCK, self.size), data.brightness.dtype),
             data,
         )
 
     def log_density(self, z: np.ndarray, data: Observations) -> np.ndarray:
         """Log posterior densities of vectors, (draw, size); minus infinity where there is none."""
-        keys = jax.random.key_data(jax.random.key(0))
-        found = in_blocks(self.described, (np.broadcast_to(keys, (len(z), *keys.shape)), z), data)
+        like = _keys_like(len(z))
+        rows = np.zeros(like.shape, like.dtype), np.zeros(len(z), bool), z
+        found = in_blocks(self.described, rows, data)
         return np.where(np.isnan(found.log_density), -np.inf, found.log_density)
 
     @functools.cached_property
@@ -293,7 +315,7 @@ def in_blocks(function: JitOnce, rows: tuple[np.ndarray, ...], given: Any) -> An
 
     def of_block(index: np.ndarray) -> Any:
         with jax.enable_x64(double), jax.default_device(device):  # no thread inherits them
-            return function(*(jnp.asarray(x[index]) for x in rows), given)
+            return function(*(x[index] for x in rows), given)
 
     def over[T](run: Callable[[np.ndarray], T], blocks: Iterator[np.ndarray]) -> Iterator[T]:
         yield run(next(blocks))  # compiled before the threads start
@@ -301,6 +323,18 @@ def in_blocks(function: JitOnce, rows: tuple[np.ndarray, ...], given: Any) -> An
             yield from pool.map(run, blocks)
 
     return map_batches(of_block, len(rows[0]), BLOCK, over)
+
+
+def _raveled(like: dict[str, jax.ShapeDtypeStruct]) -> tuple[jax.ShapeDtypeStruct, Callable]:
+    """The vector of sites of these shapes, and the function that takes it apart."""
+    functions: list[Callable] = []
+
+    def flat(sites: dict[str, Array]) -> Array:
+        vector, unravel = ravel_pytree({name: x.astype(float) for name, x in sites.items()})
+        functions.append(unravel)
+        return vector
+
+    return jax.eval_shape(flat, like), functions[0]
 
 
 def compile_program(model: Model, data: Observations) -> Program:
@@ -315,10 +349,10 @@ def compile_program(model: Model, data: Observations) -> Program:
     }
     supports = {name: site["fn"].support for name, site in latent.items()}
     prototype = {
-        name: jnp.zeros(jax.eval_shape(dist.biject_to(supports[name]).inv, site["value"]).shape)
+        name: jax.eval_shape(dist.biject_to(supports[name]).inv, site["value"])
         for name, site in latent.items()
     }
-    flat, unravel = ravel_pytree(prototype)
+    flat, unravel = _raveled(prototype)
     plates = {name: site["cond_indep_stack"] for name, site in (sampled | derived).items()}
     return Program(
         model=model,
@@ -465,22 +499,47 @@ def _check_readings(sampled: Mapping[str, dict], data: Observations) -> None:
         )
 
 
-KEYS = 500
-"""Prior draws that one call of a compiled program makes at most."""
+KEYS = 1 << 15
+"""The key of a draw depends on its index alone, so one round number serves any number of draws."""
+
+
+def keys_of_draws(key: Array, draws: int) -> np.ndarray:
+    """A key for each draw, as numbers."""
+    return np.asarray(jax.random.key_data(jax.random.split(key, KEYS * -(-draws // KEYS))))[:draws]
+
+
+def split_key(key: Array) -> tuple[Array, Array]:
+    """Two keys, by one program."""
+    return compiled(_split)(key)
+
+
+def _split(key: Array) -> tuple[Array, Array]:
+    one, other = jax.random.split(key)
+    return one, other
+
+
+def first_key() -> Array:
+    """A key of zeros, by no program."""
+    like = _keys_like(1)
+    return jax.random.wrap_key_data(jax.device_put(np.zeros(like.shape[1:], like.dtype)))
+
+
+def _keys_like(draws: int) -> jax.ShapeDtypeStruct:
+    """What `keys_of_draws` gives, without keys."""
+    return jax.eval_shape(lambda: jax.random.key_data(jax.random.split(jax.random.key(0), draws)))
 
 
 def begin_from_prior(program: Program, data: Observations) -> None:
     """Begin to compile what `from_prior` needs."""
-    key = jax.random.key_data(jax.random.key(0))
-    program.drawn_from_prior.begin(jax.ShapeDtypeStruct((KEYS, *key.shape), key.dtype), KEYS, data)
+    program.drawn_from_prior.begin(_keys_like(BLOCK), BLOCK, data)
 
 
 def from_prior(program: Program, key: Array, draws: int, data: Observations) -> np.ndarray:
     """Unconstrained vectors drawn from the prior; one compiled program serves any number."""
-    # The key of a draw depends on its index alone, so a multiple of `KEYS` serves any number.
-    keys = np.asarray(jax.random.key_data(jax.random.split(key, KEYS * -(-draws // KEYS))))
+    keys = keys_of_draws(key, draws)
 
     def drawn(index: np.ndarray) -> np.ndarray:
-        return np.asarray(program.drawn_from_prior(keys[index], min(KEYS, draws - index[0]), data))
+        wanted = min(BLOCK, draws - index[0])
+        return np.asarray(program.drawn_from_prior(keys[index], wanted, data))
 
-    return map_batches(drawn, draws, KEYS)
+    return map_batches(drawn, draws, BLOCK)

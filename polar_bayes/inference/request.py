@@ -13,11 +13,12 @@ from numpyro.primitives import Messenger
 
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, FitError
-from polar_bayes.inference.compile import TRACING_LOCK, LRUCache, cache_key, layout_of
+from polar_bayes.inference.cache_key import cache_key, layout_of
 from polar_bayes.inference.program import ModelInfo, inspect_model
 from polar_bayes.models.gp_spectral import gp_spectral
 from polar_bayes.models.hierarchical import Hierarchical
 from polar_bayes.models.per_material import per_material
+from polar_bayes.numerics.compile import TRACING_LOCK, LRUCache
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene

@@ -16,7 +16,6 @@ from jaxtyping import Array
 
 from polar_bayes.errors import FitError
 from polar_bayes.expressions import parse_value
-from polar_bayes.inference.compile import compiled
 from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.result import attributes_of, bounds_of, provenance_of
 from polar_bayes.models.gp_spectral import GpSpectral
@@ -26,6 +25,7 @@ from polar_bayes.models.spectral_process import (
     spectrum_around,
     weight_scale,
 )
+from polar_bayes.numerics.compile import compiled
 from polar_bayes.physics.dispersion import AbstractDispersion, Cauchy, Sellmeier
 from polar_bayes.physics.scene import Scene
 

@@ -31,9 +31,9 @@ from scipy import special
 
 from polar_bayes.inference.batching import batched
 from polar_bayes.inference.checks import ANGLE_SCALES
-from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.numerics.batches import AnyArray
+from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.distributions import MeanConcentrationBeta, SensorStudentT
 from polar_bayes.physics.geometry import Geometry, unit_vectors

@@ -37,12 +37,12 @@ from numpyro.distributions import transforms
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batching import LANES, ObservationBatch, Status, batched
-from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.problem_batch import empty_outcome, problem_batch
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.methods.corrected_laplace import CorrectedLaplace
 from polar_bayes.numerics.batches import AnyArray, map_elements
+from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.numerics.levenberg_marquardt import derivatives
 from polar_bayes.numerics.psis import draws_at
 from polar_bayes.observation.data import Observations

@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compile import OutOfTimeError, run_until
 from polar_bayes.inference.problem import Problem
 from polar_bayes.methods.importance import Importance
 from polar_bayes.methods.method import AbstractMethod, PosteriorDraws, flatten, make_method
 from polar_bayes.methods.nuts import Nuts
 from polar_bayes.methods.registry import method_names
+from polar_bayes.numerics.compile import OutOfTimeError, run_until
 from polar_bayes.numerics.mcse import LARGEST_R_HAT, draws_needed, largest_error
 from polar_bayes.numerics.psis import MAX_PARETO_K, max_effective_size
 from polar_bayes.progress import Progress

@@ -23,13 +23,13 @@ from polar_bayes.inference.batch_modes import (
     find_starts,
 )
 from polar_bayes.inference.batching import MethodUsed, Status, batched
-from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
 from polar_bayes.inference.program import Values
 from polar_bayes.methods.importance import Importance
 from polar_bayes.methods.method import AbstractBatchMethod
 from polar_bayes.numerics.batches import put_rows, take_rows
+from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.numerics.levenberg_marquardt import NormalApproximation
 from polar_bayes.numerics.mixtures import (
     Points,

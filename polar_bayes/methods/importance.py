@@ -27,7 +27,6 @@ from jaxtyping import Array, Float
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_modes import find_all_modes, find_conditional_modes
 from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status, batched
-from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import (
     MOMENTS,
     SMALL_BATCH,
@@ -36,7 +35,7 @@ from polar_bayes.inference.compiled_model import (
 )
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
-from polar_bayes.inference.program import THREADS, Values
+from polar_bayes.inference.program import THREADS, Values, split_key
 from polar_bayes.inference.result import CENTRAL_95
 from polar_bayes.methods.method import AbstractBatchMethod, AbstractMethod, PosteriorDraws
 from polar_bayes.methods.profile_mixture import (
@@ -49,6 +48,7 @@ from polar_bayes.methods.profile_mixture import (
     profile_mixture,
 )
 from polar_bayes.numerics.batches import AnyArray, take_rows
+from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.numerics.levenberg_marquardt import NormalApproximation
 from polar_bayes.numerics.mixtures import Mixture, draw_mixture, fit_mixture, log_density
 from polar_bayes.numerics.optimize import finite_sd
@@ -107,7 +107,7 @@ class Importance(AbstractMethod):
     def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
         initialization = problem.initialize(progress)
         coordinates = initialization.joint_coordinates("Importance")
-        key_rounds, key_resample = jax.random.split(key)
+        key_rounds, key_resample = split_key(key)
         sample = Rounds(self, profile_mixture(coordinates), key_rounds)
         while sample.is_open:
             sample.weigh(coordinates.log_density(sample.draw()))
@@ -257,7 +257,7 @@ class Rounds:
     def draw(self) -> np.ndarray:
         """Draws of the next proposal, (draw, size), which `weigh` takes next."""
         assert self._next is not None
-        self._key, key = jax.random.split(self._key)
+        self._key, key = split_key(self._key)
         proposal = self._next
         z, log_proposal = map(np.asarray, _propose(proposal, self._draws, key))
         older = [np.asarray(_log_densities(each, z)) for each in self.proposals]
@@ -304,7 +304,7 @@ class Rounds:
 
     def _fit(self, log_ratios: np.ndarray) -> Mixture:
         """A mixture for the next round."""
-        self._key, key = jax.random.split(self._key)
+        self._key, key = split_key(self._key)
         z = self.z
         weights = _temper(log_ratios, FITTED_PER_SIZE * z.shape[1])
         # One length compiles once: the draws of rounds to come have no weight.

@@ -14,13 +14,13 @@ from jaxtyping import Array
 
 from polar_bayes.inference.batch_modes import find_all_modes
 from polar_bayes.inference.batching import MethodUsed, Status, batched
-from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
 from polar_bayes.inference.program import Values
 from polar_bayes.methods.method import AbstractBatchMethod, AbstractMethod, PosteriorDraws
 from polar_bayes.numerics.batches import take_rows
+from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.numerics.optimize import SETTLED
 from polar_bayes.numerics.psis import smooth
 from polar_bayes.observation.data import Observations

@@ -14,12 +14,12 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.initialization import STARTS
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.program import Program, from_prior
 from polar_bayes.methods.method import AbstractMethod, PosteriorDraws
+from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.observation.data import Observations
 from polar_bayes.progress import Progress
 

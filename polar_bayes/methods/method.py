@@ -17,11 +17,11 @@ from jaxtyping import Array
 from polar_bayes import methods
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batching import MIN_VIEWS, MethodUsed, Status
-from polar_bayes.inference.compile import TRACING_LOCK
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
 from polar_bayes.inference.program import THREADS, Values
 from polar_bayes.methods.registry import METHODS, method_names
+from polar_bayes.numerics.compile import TRACING_LOCK
 from polar_bayes.numerics.mcse import (
     LARGEST_R_HAT,
     SMALLEST_ESS,

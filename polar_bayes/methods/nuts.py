@@ -16,19 +16,18 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, Self, override
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpyro import infer
 
-from polar_bayes.inference.compile import JitOnce
 from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.initialization import Target
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
-from polar_bayes.inference.program import Values
+from polar_bayes.inference.program import Values, first_key, split_key
 from polar_bayes.methods.importance import ONE_ROUND, suits_profiles, tail_shares
 from polar_bayes.methods.method import AbstractMethod, PosteriorDraws
+from polar_bayes.numerics.compile import JitOnce, compiled
 from polar_bayes.numerics.mcse import measure
 from polar_bayes.progress import Progress
 
@@ -82,7 +81,7 @@ class Nuts(AbstractMethod):
     @override
     def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
         initialization = problem.initialize(progress)
-        key_starts, key_chains = jax.random.split(key)
+        key_starts, key_chains = split_key(key)
         target = initialization.target(key_starts, self.chains)
         z, stats, mixed, halvings = sample(
             self._sampler(target, problem),
@@ -114,10 +113,10 @@ class Nuts(AbstractMethod):
         target = problem.compiled_model.initializer.prepare_target(problem.data)
         if target is None:
             return
+        target = target._replace(starts=np.repeat(target.starts, self.chains, axis=0))
         sampler = self._sampler(target, problem)
         if not sampler.advance.is_begun:
-            state = sampler.init(target, jax.random.key(0), target.starts[0])
-            sampler.advance.begin(state, target.given)
+            sampler.advance.begin(sampler.init(target, first_key(), 0), target.given)
 
     @override
     def for_comparison(self, problem: Problem, draws: PosteriorDraws) -> tuple[AbstractMethod, ...]:
@@ -188,8 +187,7 @@ def sample(
 ) -> tuple[np.ndarray, dict[str, np.ndarray], bool, int]:
     """Draws (chain, draw, size), statistics, whether the goals were reached, halvings of steps."""
     warmup = sampler.static.warmup
-    keys = jax.random.split(key, settings.chains)
-    states = [sampler.init(target, key, at) for key, at in zip(keys, target.starts, strict=True)]
+    states = [sampler.init(target, key, chain) for chain in range(settings.chains)]
     # Compiled before the threads start: all then share one executable.
     advance = sampler.advance.program(states[0], target.given)
 
@@ -292,23 +290,36 @@ class Sampler:
         self._init, self._next = infer.hmc.hmc(
             potential_fn_gen=lambda given: lambda z: density(z, given), algo="NUTS"
         )
+        self._begin = compiled(self._start)
 
-    def init(self, target: Target, key: Array, start: np.ndarray) -> infer.hmc.HMCState:
-        value, gradient = target.potential(start)
+    def init(self, target: Target, key: Array, chain: int) -> infer.hmc.HMCState:
+        """The state of one of the chains that share a key."""
+        value, gradient = target.potential(target.starts[chain])
+        density = np.asarray(value, target.starts.dtype), np.asarray(gradient)
+        return self._begin(target.starts, chain, density, target.metric, target.given, key)
+
+    def _start(
+        self,
+        starts: Array,
+        chain: Array,
+        density: tuple[Array, Array],
+        metric: Array,
+        given: Any,
+        key: Array,
+    ) -> infer.hmc.HMCState:
         # Value and gradient are given, so that starting a chain compiles no model.
-        given = infer.util.ParamInfo(jnp.asarray(start), jnp.asarray(value), jnp.asarray(gradient))
         return self._init(
-            given,
+            infer.util.ParamInfo(starts[chain], *density),
             self.static.warmup,
             step_size=0.5,
-            inverse_mass_matrix=jnp.asarray(target.metric),
+            inverse_mass_matrix=metric,
             dense_mass=self.static.adapts_metric,
             adapt_mass_matrix=self.static.adapts_metric,
             target_accept_prob=self.static.acceptance,
             trajectory_length=None,
             max_tree_depth=self.static.max_tree_depth,
-            model_args=(target.given,),
-            rng_key=key,
+            model_args=(given,),
+            rng_key=jax.random.split(key, len(starts))[chain],
         )
 
     def _advance(self, state: infer.hmc.HMCState, given: Any) -> tuple[infer.hmc.HMCState, Step]:

@@ -16,7 +16,7 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import DTypeLike, Float, Int
 
@@ -136,19 +136,21 @@ def mixture_of(components: Components, dtype: DTypeLike) -> Mixture:
     which = np.resize(np.arange(share.size), COMPONENTS * -(-share.size // COMPONENTS))
     share = (share / np.bincount(which))[which]
     size = components.z.shape[1]
-    return Mixture(
-        center=jnp.zeros(size, dtype),
-        half=jnp.eye(size, dtype=dtype),
-        log_share=jnp.asarray(np.log(share / share.sum()), dtype),
-        mean=jnp.asarray(components.z[which], dtype),
-        scale=jnp.asarray(np.linalg.cholesky(components.covariance)[which], dtype),
+    parts = (
+        np.zeros(size),
+        np.eye(size),
+        np.log(share / share.sum()),
+        components.z[which],
+        np.linalg.cholesky(components.covariance)[which],
     )
+    return Mixture(*jax.device_put([part.astype(dtype) for part in parts]))
 
 
 def profile_mixture(coordinates: Coordinates) -> Mixture:
     """Components at every heavy mode of one capture, and along its profiles."""
     modes = coordinates.modes
-    dtype = jnp.asarray(modes.z).dtype  # of the fit: modes are searched in double precision
+    # Of the fit: modes are searched in double precision.
+    dtype = jax.dtypes.canonicalize_dtype(modes.z.dtype)
     potential = finite_potential(coordinates.potential)
     heavy = modes.weight >= LEAST_WEIGHT
     z, covariance = modes.z[heavy], modes.covariance[heavy]

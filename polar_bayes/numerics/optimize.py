@@ -17,7 +17,6 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 import scipy.optimize
@@ -108,7 +107,7 @@ class DifferencedPotential[Given]:
 
     def __init__(
         self,
-        evaluated: Callable[[Array, Given], tuple[Array, Mapping[str, Array]]],
+        evaluated: Callable[[np.ndarray, Given], tuple[Array, Mapping[str, Array]]],
         given: Given,
         sd: np.ndarray,
     ) -> None:
@@ -125,7 +124,7 @@ class DifferencedPotential[Given]:
 
     def _evaluate(self, z: np.ndarray) -> tuple[np.ndarray, Mapping[str, Array]]:
         shift = np.diag(self._step)
-        rows = jnp.asarray(np.vstack([z, z + shift, z - shift]))
+        rows = np.vstack([z, z + shift, z - shift])
         potentials, parameters = self._evaluated(rows, self._given)
         return np.asarray(potentials, float), parameters
 

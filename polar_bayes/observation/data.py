@@ -103,18 +103,21 @@ def observe(
         angles["wavelength"] = _values(capture, "wavelength", order)
     confidence = None
     if "normal_confidence" in capture:
-        confidence = jnp.asarray(_values(capture, "normal_confidence", order))
+        confidence = _values(capture, "normal_confidence", order)
+    arrays = {
+        "readings": readings,
+        "errors": errors,
+        "brightness": np.clip(brightness, 0.0, 1.0),
+        "full_scale": np.asarray(full_scale / largest),
+        "intensity_unit": np.asarray(largest),
+        "valid": valid,
+        "saturated": saturated,
+        "confidence": confidence,
+    }
     return Observations(
-        geometry=Geometry.from_degrees(**{name: jnp.asarray(x) for name, x in angles.items()}),
-        readings={name: jnp.asarray(x) for name, x in readings.items()},
-        errors={name: jnp.asarray(x) for name, x in errors.items()},
-        brightness=jnp.clip(jnp.asarray(brightness), 0.0, 1.0),
-        full_scale=jnp.asarray(full_scale / largest),
-        intensity_unit=jnp.asarray(largest),
-        valid=jnp.asarray(valid),
-        saturated=jnp.asarray(saturated),
+        geometry=Geometry.from_degrees(**angles),
         dims=tuple(zip(order, shape, strict=True)),
-        confidence=confidence,
+        **jax.device_put(arrays),  # where `jnp.asarray` of each would run a program
     )
 
 

@@ -66,16 +66,17 @@ class Geometry(NamedTuple):
         Returns:
             Geometry of shape (..., view); a lone angle counts as one view.
         """
-        angles = [
-            jnp.asarray(angle) for angle in (view_zenith, view_azimuth, light_zenith, light_azimuth)
-        ]
-        dtype = jnp.result_type(float, *angles)
-        angles = [jnp.atleast_1d(angle).astype(dtype) for angle in angles]
-        view_zenith, view_azimuth, light_zenith, light_azimuth = jnp.broadcast_arrays(*angles)
-        view_azimuth = jnp.where(view_zenith == 0.0, light_azimuth + 180.0, view_azimuth)
+        given = (view_zenith, view_azimuth, light_zenith, light_azimuth, wavelength)
+        # Numbers and NumPy arrays need no compiled program for each step.
+        of = jnp if any(isinstance(each, jax.Array) for each in given) else np
+        dtype = jnp.result_type(float, *map(of.asarray, given[:4]))
+        angles = [of.atleast_1d(of.asarray(angle, dtype)) for angle in given[:4]]
+        view_zenith, view_azimuth, light_zenith, light_azimuth = of.broadcast_arrays(*angles)
+        view_azimuth = of.where(view_zenith == 0.0, light_azimuth + 180.0, view_azimuth)
         if wavelength is not None:
-            wavelength = jnp.asarray(wavelength, dtype)
-        return cls(view_zenith, view_azimuth, light_zenith, light_azimuth, wavelength)
+            wavelength = of.asarray(wavelength, dtype)
+        found = (view_zenith, view_azimuth, light_zenith, light_azimuth, wavelength)
+        return cls(*(jax.device_put(found) if of is np else found))
 
     def reversed(self) -> "Geometry":
         """Light and viewer in each other's place."""

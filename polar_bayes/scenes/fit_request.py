@@ -23,13 +23,13 @@ from polar_bayes import methods
 from polar_bayes.capture.plausibility import cautions, indices_by_eye
 from polar_bayes.capture.schema import count
 from polar_bayes.errors import FitError
-from polar_bayes.inference.compile import OutOfTimeError, check_memory, run_until
 from polar_bayes.inference.prior_probability import has_probabilities, probability_below
 from polar_bayes.inference.problem import Problem, make_problem
 from polar_bayes.inference.program import BLOCK, THREADS, from_prior
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import assemble, posterior_of
 from polar_bayes.methods.method import AbstractMethod, find_method
+from polar_bayes.numerics.compile import OutOfTimeError, check_memory, compiled, run_until
 from polar_bayes.numerics.mcse import SMALLEST_ESS
 from polar_bayes.physics.instrument import AbstractInstrumentTerm, Discrepancy
 from polar_bayes.physics.scene import Scene
@@ -52,11 +52,8 @@ def fit_request(
     with_comparisons: bool = True,
 ) -> xr.DataTree:
     """The fit of a request, in the precision that is switched on."""
-    key, key_comparisons, key_posterior, key_prior = jax.random.split(
-        jax.random.key(request.seed), 4
-    )
-    key_search, key_draws = jax.random.split(key)
-    key_check = jax.random.fold_in(key, 1)
+    keys = compiled(_keys)(np.uint32(request.seed))
+    key_search, key_draws, key_check, key_comparisons, key_posterior, key_prior = keys
     problem = make_problem(request, key_search, start_time)
     _check_room(problem, PRIOR_DRAWS)
     method.prepare(problem)
@@ -115,6 +112,12 @@ def fit_request(
         comparisons,
         provenance,
     )
+
+
+def _keys(seed: Array) -> tuple[Array, ...]:
+    """Of the search, the draws, their check, the comparisons, and both predictions."""
+    key, comparisons, posterior, prior = jax.random.split(jax.random.key(seed), 4)
+    return (*jax.random.split(key), jax.random.fold_in(key, 1), comparisons, posterior, prior)
 
 
 def choose_method(
@@ -305,7 +308,7 @@ def _provenance(request: Request, method: AbstractMethod, problem: Problem) -> d
         for x in [data.readings[name]]
     }
     packages = ("polar_bayes", "jax", "numpyro", "arviz", "optimistix", "numpy", "xarray")
-    used = {"used": int(np.sum(data.valid)), "at_margin": at_boundary}
+    used = {"used": int(np.sum(np.asarray(data.valid))), "at_margin": at_boundary}
     return {
         "settings": dataclasses.asdict(method),
         "method_parts": repr(method),

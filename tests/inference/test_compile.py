@@ -16,8 +16,8 @@ from plates import plate_capture
 from toy_models import line
 
 import polar_bayes as pb
-from polar_bayes.inference import compile
-from polar_bayes.inference.compile import JitOnce, bytes_of
+from polar_bayes.numerics import compile
+from polar_bayes.numerics.compile import JitOnce, bytes_of
 from polar_bayes.scenes import fit_request as fitting
 
 

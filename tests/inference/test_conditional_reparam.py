@@ -13,10 +13,10 @@ from numpyro import distributions as dist
 from scipy import stats
 
 import polar_bayes as pb
-from polar_bayes.inference.compile import LRUCache
 from polar_bayes.inference.conditional_reparam import ConditionalReparam, find_coefficients
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
+from polar_bayes.numerics.compile import LRUCache
 from polar_bayes.observation.data import Observations, observe
 
 VIEWS, NOISE, WIDTH = 9, 0.05, 0.3
@@ -111,7 +111,7 @@ def posterior_of_index(link: pb.links.AbstractLink | None, method: str) -> tuple
 @pytest.mark.parametrize("method", ["nuts", "importance"])
 def test_chains_of_both_coordinates_agree(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     mean, error = posterior_of_index(None, method)
-    monkeypatch.setattr("polar_bayes.inference.problem._COMPILED", LRUCache(1))
+    monkeypatch.setattr("polar_bayes.inference.compiled_model._COMPILED", LRUCache(1))
     monkeypatch.setattr("polar_bayes.inference.initialization.find_coefficients", lambda *_: None)
     expected, own_error = posterior_of_index(None, "nuts")
     assert abs(mean - expected) < 4.0 * np.hypot(error, own_error)

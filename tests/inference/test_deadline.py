@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from polar_bayes.inference.compile import (
+from polar_bayes.numerics.compile import (
     TRACING_LOCK,
     AbandonedError,
     JitOnce,

@@ -21,13 +21,14 @@ from plates import LINKS, PLATE, plate_capture, plates
 from spectral_plates import spectral_plate
 
 import polar_bayes as pb
-from polar_bayes.inference import problem, request
 from polar_bayes.inference import program as programs
-from polar_bayes.inference.compile import LRUCache, cache_key
+from polar_bayes.inference import request
+from polar_bayes.inference.cache_key import cache_key
 from polar_bayes.inference.problem import compile_model
 from polar_bayes.inference.program import ModelInfo, inspect_model
 from polar_bayes.inference.request import resolve
 from polar_bayes.models.per_material import per_material
+from polar_bayes.numerics.compile import LRUCache
 from polar_bayes.numerics.optimize import ignore_line_search_warnings
 from polar_bayes.observation.data import observe
 from polar_bayes.scenes.effects import ChosenScene
@@ -117,7 +118,7 @@ def test_a_key_of_a_draw_depends_on_its_place_alone() -> None:
     """`fit` splits a round number of keys; the first of them must be those of any number."""
     key = jax.random.key(5)
     many, few = (
-        jax.random.key_data(jax.random.split(key, count)) for count in (problem.KEYS, 1234)
+        jax.random.key_data(jax.random.split(key, count)) for count in (programs.KEYS, 1234)
     )
     assert np.array_equal(many[:1234], few)
 
@@ -126,7 +127,7 @@ def test_a_key_of_a_draw_depends_on_its_place_alone() -> None:
 def test_any_number_of_prior_draws_is_served_by_one_program(
     compiled: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(programs, "KEYS", 8)
+    monkeypatch.setattr(programs, "BLOCK", 8)
     with jax.enable_x64(True):
         data = observe(one(1))
         program = compiled_model(one(1)).program

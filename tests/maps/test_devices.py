@@ -13,7 +13,7 @@ SCRIPT = """
 import jax
 from plate_images import ASKED, plate_image
 import polar_bayes as pb
-from polar_bayes.inference.compile import JitOnce
+from polar_bayes.numerics.compile import JitOnce
 
 jax.config.update("jax_disable_most_optimizations", True)
 _, second = jax.devices()

@@ -6,32 +6,22 @@ in parallel with everything else.
 """
 
 import contextvars
-import dataclasses
 import functools
-import gc
 import os
 import queue
-import sys
 import threading
 import time
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import cachetools
 import jax
-import numpy as np
-from dask.base import tokenize
 from jax.experimental.compilation_cache import compilation_cache
-from numpyro import distributions as dist
 
 from polar_bayes.errors import FitError
-from polar_bayes.observation.data import Observations
-from polar_bayes.observation.links import AbstractLink
 from polar_bayes.paths import compiled_folder, make_private
-from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress
 
 COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
@@ -98,12 +88,11 @@ def keep_compiled_programs() -> None:
     compilation_cache.reset_cache()  # JAX looks for the folder once, when it first compiles
 
 
-def compiled(function: Callable) -> Any:
+def compiled(function: Callable, *, static_argnames: Sequence[str] = ()) -> Any:
     """The function under `jax.jit`, with `COMPILER_OPTIONS` on a CPU."""
     keep_compiled_programs()
-    return jax.jit(
-        function, compiler_options=COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
-    )
+    options = COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
+    return jax.jit(function, compiler_options=options, static_argnames=static_argnames)
 
 
 class JitOnce:
@@ -203,7 +192,7 @@ def memory_limit() -> int | None:
     return min(limits, default=None)
 
 
-# --- The cache of compiled programs, which fits of one layout share -------------------------------
+# --- A cache of compiled programs -----------------------------------------------------------------
 
 
 class LRUCache[T]:
@@ -224,95 +213,6 @@ class LRUCache[T]:
             if key not in self._values:
                 self._values[key] = make()
             return self._values[key]
-
-
-def cache_key(
-    model: Callable,
-    scene: Scene,
-    priors: Mapping[str, dist.Distribution],
-    links: Mapping[str, AbstractLink],
-    *further: Any,
-) -> str:
-    """A text that is equal for requests whose compiled programs are the same."""
-    scene = dataclasses.replace(scene)  # without its ledger
-    parts = [
-        model,
-        scene,
-        # Not the priors themselves: distributions store what they have computed.
-        *(
-            (name, jax.tree.leaves(prior), str(jax.tree.structure(prior)))
-            for name, prior in priors.items()
-        ),
-        links,
-        *_code_of(model, scene, links, *map(type, priors.values())),
-        *further,
-    ]
-    # One by one: a token depends on which of the objects inside it are identical.
-    return tokenize([tokenize(part) for part in parts])
-
-
-def layout_of(data: Observations) -> tuple[str, ...]:
-    """What programs depend on in a capture: variables, axes, lengths and types, not readings."""
-    return (str(jax.tree.structure(data)), *(f"{x.dtype}{x.shape}" for x in jax.tree.leaves(data)))
-
-
-CONSTANTS = (str, bytes, int, float, complex, np.ndarray, np.generic, jax.Array)
-
-
-def _code_of(*roots: object) -> Iterator[object]:
-    """Byte code of the user's functions that the roots refer to, and the constants they read."""
-    # A function or class that is edited and loaded again keeps its name, by which it is pickled.
-    # Programs compiled from the old code must not serve the new one.
-    seen: dict[int, object] = {}  # holds the objects, so that no other one gets the same id
-    pending = list(roots)
-    while pending:
-        value = pending.pop()
-        if isinstance(value, CONSTANTS):
-            yield value
-        elif id(value) not in seen:
-            seen[id(value)] = value
-            if isinstance(value, FunctionType) and not _is_installed(value.__module__):
-                yield value.__code__
-            pending.extend(_references(value))
-
-
-def _references(value: object) -> Iterable[object]:
-    """Objects whose code may run when a value is used."""
-    if isinstance(value, ModuleType):
-        return ()
-    if isinstance(value, FunctionType):
-        attached = (value.__closure__, value.__dict__)
-        if _is_installed(value.__module__):
-            return attached
-        return (*attached, value.__defaults__, value.__kwdefaults__, *_globals_of(value))
-    if isinstance(value, type):
-        return () if _is_installed(value.__module__) else (*vars(value).values(), *value.__bases__)
-    if type(value).__module__ in ("builtins", "functools"):  # containers, cells, methods, partials
-        return gc.get_referents(value)
-    return (type(value), *getattr(value, "__dict__", {}).values())
-
-
-def _globals_of(function: FunctionType) -> Iterator[object]:
-    """Values of the global names in a function, and of attributes of the user's own modules."""
-    codes = [function.__code__]
-    names: list[str] = []
-    for code in codes:
-        names.extend(code.co_names)
-        codes.extend(constant for constant in code.co_consts if isinstance(constant, CodeType))
-    for name in names:
-        value = function.__globals__.get(name)
-        yield value
-        if isinstance(value, ModuleType) and not _is_installed(value.__name__):
-            yield from (getattr(value, attribute, None) for attribute in names)
-
-
-def _is_installed(module: str | None) -> bool:
-    """Whether a module is part of Python, of this package or of another installed one."""
-    package = (module or "").partition(".")[0]
-    if package in sys.stdlib_module_names or package == "polar_bayes":
-        return True
-    file = getattr(sys.modules.get(module or ""), "__file__", None) or ""
-    return not {"site-packages", "dist-packages"}.isdisjoint(Path(file).parts)
 
 
 # --- Deadlines: compiled programs cannot be interrupted, but their thread can be abandoned --------
