@@ -48,19 +48,6 @@ def test_a_rough_way_out_tends_to_the_plane(stack: Stack) -> None:
     assert np.max(gaps[1]) < 3e-4
 
 
-@stacks
-@each("way_out", [RoughExit(), SmoothExit()], ids=["rough", "smooth"])
-def test_no_more_leaves_than_there_is_and_it_is_polarized_along_the_plane(
-    way_out: object, stack: Stack
-) -> None:
-    leaving = RoughSurface(way_out=way_out).exit(MATERIAL, VIEWS, stack)
-    assert np.all(leaving.intensity > 0.0)
-    assert np.all(leaving.intensity < 1.0)
-    assert np.all(leaving.q[1:] < 0.0)
-    assert np.all(np.hypot(leaving.q, leaving.u) < 1.0)
-    np.testing.assert_allclose(leaving.q[0], 0.0, atol=1e-3)
-
-
 def test_grooves_polarize_even_towards_the_normal() -> None:
     """More than an isotropic surface can; the axis follows the grooves."""
     for turn, sign in ((20.0, 1.0), (110.0, -1.0)):

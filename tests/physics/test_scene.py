@@ -155,20 +155,6 @@ def test_the_instrument_is_not_in_the_optics() -> None:
     np.testing.assert_array_equal(stokes_of(camera, optics_only, VIEWS), stokes)
 
 
-@pytest.mark.thorough
-def test_angle_zero_moves_the_geometry() -> None:
-    scene = Scene(SmoothSurface(), instrument=Instrument((AngleZero(),)))
-    shifted = scene.predict({**PARAMETERS, "angle_zero": 2.0}, VIEWS)
-    moved = VIEWS._replace(
-        view_zenith=VIEWS.view_zenith + 2.0, light_zenith=VIEWS.light_zenith + 2.0
-    )
-    np.testing.assert_allclose(
-        shifted["q"],
-        scene.stokes(PARAMETERS, moved)[:, 1] / (scene.stokes(PARAMETERS, moved)[:, 0]),
-        rtol=1e-12,
-    )
-
-
 def test_missing_parameters_are_named() -> None:
     with pytest.raises(SceneError, match="parameters: absorption, refractive_index missing; this"):
         SCENES["paper"].stokes({"roughness": 0.1, "subsurface_fraction": 0.2}, VIEWS)

@@ -69,14 +69,6 @@ def test_the_default_capture_follows_the_papers_protocol():
 
 
 @pytest.mark.thorough
-def test_without_wavelengths_there_is_no_color():
-    capture = simulate("glass", scene=PLATE, protocol=MANY)
-    assert dict(capture.sizes) == {"view": 3000}
-    assert capture["true_refractive_index"].dims == ()
-    assert float(capture["true_refractive_index"]) == PRESETS["glass"].refractive_index[1]
-
-
-@pytest.mark.thorough
 def test_stated_errors_come_with_the_links_that_read_them():
     capture = simulate("glass", scene="goniometer")
     np.testing.assert_array_equal(capture["q_error"], np.full((40, 3), STATED_ERROR))
