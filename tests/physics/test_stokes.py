@@ -32,6 +32,7 @@ def test_unpolarized_light_has_finite_derivatives(dtype: type) -> None:
     assert length(zero) == pytest.approx(TIP, rel=1e-6)
     np.testing.assert_array_equal(jax.jit(jax.grad(length))(zero), 0.0)
     np.testing.assert_allclose(jax.jit(jax.hessian(length))(zero), np.eye(2) / TIP, rtol=1e-5)
+    np.testing.assert_allclose(length(jnp.array([3e-7, 4e-7], dtype)), 5e-7, rtol=1e-6)
 
 
 @each(
