@@ -12,6 +12,7 @@ os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")  # befo
 
 import jax
 import pytest
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 jax.config.update("jax_enable_x64", True)
@@ -42,5 +43,6 @@ def measured() -> Path:
 def unpainted() -> Iterator[None]:
     """Pictures of pages stay blank, which takes most of their time; others test what they show."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Figure, "savefig", lambda _, file, **__: file.write(b"<svg/>"))
+        for way, name in ((Figure, "savefig"), (FigureCanvasSVG, "print_svg")):
+            patch.setattr(way, name, lambda _, file, **__: file.write(b"<svg/>"))
         yield
