@@ -12,8 +12,7 @@ os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")  # befo
 
 import jax
 import pytest
-from matplotlib.backends.backend_svg import FigureCanvasSVG
-from matplotlib.figure import Figure
+from pages import blank_pictures
 
 jax.config.update("jax_enable_x64", True)
 
@@ -41,8 +40,6 @@ def measured() -> Path:
 
 @pytest.fixture(scope="module")
 def unpainted() -> Iterator[None]:
-    """Pictures of pages stay blank, which takes most of their time; others test what they show."""
-    with pytest.MonkeyPatch.context() as patch:
-        for way, name in ((Figure, "savefig"), (FigureCanvasSVG, "print_svg")):
-            patch.setattr(way, name, lambda _, file, **__: file.write(b"<svg/>"))
+    """Pages without pictures, which take most of their time; others test what pictures show."""
+    with blank_pictures():
         yield

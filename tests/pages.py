@@ -1,6 +1,12 @@
 """Pages as tests read them: tags, attributes and texts."""
 
+import contextlib
+from collections.abc import Iterator
 from html.parser import HTMLParser
+
+import pytest
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 LINES = {"h1", "h2", "h3", "p", "tr", "li", "figcaption", "summary", "a", "caption", "dt", "pre"}
@@ -13,7 +19,7 @@ class Page(HTMLParser):
 
     def __init__(self, text: str) -> None:
         super().__init__()
-        self.tags, self.attributes, self.texts, self.open = [], [], [], []
+        self.tags, self.attributes, self.texts, self.read, self.open = [], [], [], [], []
         self.feed(text)
         self.close()
 
@@ -24,30 +30,31 @@ class Page(HTMLParser):
         if tag not in VOID:
             self.open.append(tag)
         if tag in LINES:
-            self.texts.append("\n")
+            self.read.append("\n")
         elif tag in ("td", "th"):
-            self.texts.append(f"| <{kind}>" if kind else "|")
+            self.read.append(f"| <{kind}>" if kind else "|")
         elif tag == "section" and kind:
-            self.texts.append(f"\n<{kind}>")
+            self.read.append(f"\n<{kind}>")
         elif tag == "img":
-            self.texts.append(f"\n[{dict(attrs).get('alt')}]")
+            self.read.append(f"\n[{dict(attrs).get('alt')}]")
 
     def handle_endtag(self, tag) -> None:
         assert self.open.pop() == tag
 
     def handle_data(self, data) -> None:
         if "style" not in self.open:
-            self.texts.append(" ".join(data.split()))
+            self.texts.append(data)
+            self.read.append(" ".join(data.split()))
 
     @property
     def lines(self) -> list[str]:
         """What a reader reads: a line for each paragraph, row, link or picture."""
-        lines = " ".join(self.texts).split("\n")
+        lines = " ".join(self.read).split("\n")
         return [line for line in (" ".join(line.split()) for line in lines) if line]
 
     @property
     def text(self) -> str:
-        return " ".join(" ".join(self.lines).replace("|", " ").split())
+        return " ".join(" ".join(self.texts).split())
 
     def values(self, name: str) -> list[str]:
         return [value for _, attribute, value in self.attributes if attribute == name]
@@ -75,3 +82,12 @@ def faults_of(page: Page) -> list[str]:
         "no policy": "default-src 'none'" not in " ".join(page.values("content")),
     }
     return [f"{what}: {which}" for what, which in found.items() if which]
+
+
+@contextlib.contextmanager
+def blank_pictures() -> Iterator[None]:
+    """Nothing is drawn where a figure is written to a page."""
+    with pytest.MonkeyPatch.context() as patch:
+        for way, name in ((Figure, "savefig"), (FigureCanvasSVG, "print_svg")):
+            patch.setattr(way, name, lambda _, file, **__: file.write(b"<svg/>"))
+        yield

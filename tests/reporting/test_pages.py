@@ -1,9 +1,10 @@
 """Pages word by word: what a reader is told by results of every kind, as it was approved.
 
-    python tests/reporting/test_pages.py    take the present words as the approved ones
+    PYTHONPATH=tests python tests/reporting/test_pages.py
 
-Every table, sentence, link and alternative text is a line of `approved/NAME.txt`. Words change only
-with a reason, which the commit that changes them states.
+takes the present words as the approved ones. Every row, sentence, link and alternative text is a
+line of `approved/NAME.txt`. Words change only with a reason, which the commit that changes them
+states.
 """
 
 import difflib
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from cases import each
-from pages import EVIL, Page, faults_of
+from pages import EVIL, Page, blank_pictures, faults_of
 from synthetic_accuracy import make_accuracy
 from synthetic_calibrations import NAMES, make_calibration
 from synthetic_maps import make_maps
@@ -225,8 +226,9 @@ def test_a_page_of_a_rarer_result_says_what_was_approved(name: str) -> None:
 def write_all() -> None:
     """Every page, as it is now."""
     APPROVED.mkdir(exist_ok=True)
-    for name, make in (CASES | MORE).items():
-        approved_file(name).write_text("\n".join(Page(make()).lines) + "\n")
+    with blank_pictures():
+        for name, make in (CASES | MORE).items():
+            approved_file(name).write_text("\n".join(Page(make()).lines) + "\n")
 
 
 if __name__ == "__main__":
