@@ -5,12 +5,14 @@ it to (`polar_bayes.numerics.compile.compiled`), which takes a third of the time
 """
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")  # before JAX is imported
 
 import jax
 import pytest
+from pages import blank_pictures
 
 jax.config.update("jax_enable_x64", True)
 
@@ -34,3 +36,10 @@ def measured() -> Path:
     if not folder.is_dir():
         pytest.skip("no measured data: set POLAR_BAYES_DATA to the folder that holds them")
     return folder
+
+
+@pytest.fixture(scope="module")
+def unpainted() -> Iterator[None]:
+    """Pages without pictures, which take most of their time; others test what pictures show."""
+    with blank_pictures():
+        yield

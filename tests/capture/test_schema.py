@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from cases import each
 
-from polar_bayes.capture.schema import CONTRACT, LEADING, Interval, count, validate
+from polar_bayes.capture.schema import CONTRACT, LEADING, count, validate
 from polar_bayes.errors import CaptureError
 
 
@@ -435,11 +435,3 @@ def test_only_a_dataset_is_a_capture(thing):
     of_path = "read it first: pb.load_capture('leaf.nc')"
     assert (of_path if isinstance(thing, str) else "give an xarray.Dataset") in message
     assert "pb.from_table('leaf.csv')" in refused("leaf.csv", "a str is not a capture")
-
-
-@pytest.mark.thorough
-def test_an_interval_knows_its_ends():
-    half_open = Interval(0.0, 90.0, open_high=True)
-    assert str(half_open) == "0 <= value < 90"
-    values = np.array([-1.0, 0.0, 90.0, np.nan])
-    np.testing.assert_array_equal(half_open.contains(values), [False, True, False, False])

@@ -4,11 +4,12 @@ import json
 from pathlib import Path
 
 import pytest
-from cases import each
 from synthetic_accuracy import make_accuracy
 
 import polar_bayes as pb
 from polar_bayes.cli import main
+
+pytestmark = pytest.mark.usefixtures("unpainted")
 
 
 @pytest.fixture
@@ -56,26 +57,6 @@ def test_rungs_and_dials_are_chosen_and_json_is_json(plate, tmp_path, capsys, st
     assert said["advice"].startswith("No method is within 0.001 sd")
     assert list(studied["methods"]) == ["laplace", "nuts"]
     assert studied["overrides"] == ()
-
-
-def test_a_method_that_is_not_there_is_refused(plate, tmp_path, capsys):
-    words = ["accuracy", str(plate), "--out", str(tmp_path / "a.nc"), "--method", "magic"]
-    assert main(words) == 1
-    assert "--method magic: no such method; give one of point, laplace" in capsys.readouterr().err
-
-
-@pytest.mark.thorough
-@each(
-    ("words", "said"),
-    [
-        (["--tolerance", "0.1"], "--tolerance needs --choose-effects or --method auto"),
-        (["--seconds", "5"], "--seconds needs --method auto"),
-        (["--method", "auto", "--tolerance", "7"], "tolerance is 7.0"),
-    ],
-)
-def test_wishes_that_do_not_fit_the_method_are_refused(plate, tmp_path, capsys, words, said):
-    assert main(["fit", str(plate), "--out", str(tmp_path / "fit.nc"), *words]) == 1
-    assert said in capsys.readouterr().err
 
 
 @pytest.mark.thorough

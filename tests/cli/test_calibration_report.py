@@ -8,6 +8,8 @@ from synthetic_calibrations import make_calibration
 import polar_bayes as pb
 from polar_bayes.cli import main
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 
 @pytest.fixture
 def files(tmp_path: Path) -> Path:

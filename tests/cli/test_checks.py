@@ -76,13 +76,3 @@ def test_identify_follows_a_profile(plate: Path, capsys: pytest.CaptureFixture[s
     assert told["profile of subsurface_fraction: sentences"][0].startswith(
         "subsurface_fraction is "
     )
-
-
-def test_a_mistake_is_one_line(
-    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = str(tmp_path / "sbc.nc")
-    assert main(["calibrate", str(plate), "--out", out, "--simulations", "3"]) == 1
-    assert capsys.readouterr().err.splitlines() == ["calibrate: simulations is 3; give 20 or more"]
-    assert main(["calibrate", str(plate), "--out", out, "--method", "magic"]) == 1
-    assert "--method magic: no such method" in capsys.readouterr().err

@@ -13,10 +13,11 @@ from polar_bayes.methods import method
 
 def test_simulate_writes_what_fit_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "leaf.nc"
-    assert main(["simulate", "--preset", "leaf", "--seed", "3", "--out", str(file)]) == 0
+    words = ["simulate", "--preset", "leaf", "--scene", "picture", "--views", "8", "--seed", "3"]
+    assert main([*words, "--out", str(file)]) == 0
     assert capsys.readouterr().out.startswith(str(file))
     capture = pb.load_capture(file)
-    assert dict(capture.sizes) == {"view": 40, "wavelength": 3}
+    assert dict(capture.sizes) == {"view": 8, "wavelength": 3}
 
 
 @pytest.mark.thorough
@@ -140,51 +141,43 @@ def test_combine_puts_captures_side_by_side(
 
 
 WRONG = {
-    "no command": (["frob"], "No such command"),
-    "no file": (["fit", "nowhere.nc", "--out", "fit.nc"], "nowhere.nc: there is no such file"),
-    "no out": (["fit", "PLATE"], "Missing option '--out'"),
-    "model": (["fit", "PLATE", "--model", "x", "--out", "OUT"], "no such model"),
-    "method": (["fit", "PLATE", "--method", "x", "--out", "OUT"], "no such method"),
-    "scene": (["fit", "PLATE", "--scene", "x", "--out", "OUT"], "no such scene"),
-    "scene file": (["fit", "PLATE", "--scene", "x.toml", "--out", "OUT"], "no such file"),
-    "prior": (["fit", "PLATE", "--prior", "angle_zero", "--out", "OUT"], "does not say of what"),
-    "link": (["fit", "PLATE", "--link", "q=X()", "--out", "OUT"], "X is not known here"),
-    "two links": (
-        ["fit", "PLATE", "--link", "q=StokesLink()", "--link", "StokesLink()", "--out", "OUT"],
-        "--link without a variable",
-    ),
-    "settings": (["fit", "PLATE", "--method", "Nuts(num_samples=9)", "--out", "OUT"], "draws?"),
-    "tree depth": (
-        ["fit", "PLATE", "--method", "laplace", "--max-tree-depth", "9", "--out", "OUT"],
-        "--max-tree-depth: of --method nuts only",
-    ),
-    "scene of a capture": (["scene", "--from", "PLATE"], "it holds no result"),
-    "seed": (["fit", "PLATE", "--seed", "-1", "--out", "OUT"], "--seed"),
-    "limit": (["fit", "PLATE", "--largest-view-zenith", "0", "--out", "OUT"], "give degrees"),
-    "one view": (
-        ["fit", "PLATE", "--largest-view-zenith", "21", "--out", "OUT"],
-        "only 1 valid view",
-    ),
-    "folder": (["fit", "PLATE", "--out", "/nowhere/fit.nc"], "its folder is not there"),
-    "effect": (["effects", "PLATE", "--drop", "Fog"], "--drop Fog: the scene has no such effect"),
-    "set-up": (["effects", "PLATE", "--scene", "x"], "no such scene"),
-    "tolerance": (["effects", "PLATE", "--tolerance", "0"], "tolerance is 0.0"),
-    "tolerance of what": (
-        ["fit", "PLATE", "--tolerance", "0.2", "--out", "OUT"],
-        "--tolerance needs --choose-effects",
-    ),
-    "map of no image": (["map", "PLATE", "--out", "OUT"], "it has no axis y or x; give an image"),
-    "no image": (["map", "nowhere.zarr", "--out", "OUT"], "nowhere.zarr: there is no such store"),
-    "draws": (["map", "PLATE", "--draws", "5", "--out", "OUT"], "draws is 5; give 64, 128"),
-    "draws of what": (
-        ["map", "PLATE", "--method", "importance", "--draws", "256", "--out", "OUT"],
-        "--draws needs --method corrected-laplace",
-    ),
-    "report of a capture": (["report", "PLATE", "--out", "OUT"], "it holds no result"),
-    "preset": (["simulate", "--preset", "x", "--out", "OUT"], "no such material"),
-    "views": (["simulate", "--views", "1", "--out", "OUT"], "views is 1"),
-    "zenith": (["simulate", "--largest-view-zenith", "90", "--out", "OUT"], "below 90"),
-    "table": (["import", "goniometer", "--s", "x", "--p", "y", "--out", "OUT"], "no such file"),
+    "frob": "No such command",
+    "fit nowhere.nc --out fit.nc": "nowhere.nc: there is no such file",
+    "fit PLATE": "Missing option '--out'",
+    "fit PLATE --model x --out OUT": "no such model",
+    "fit PLATE --method x --out OUT": "no such method",
+    "fit PLATE --scene x --out OUT": "no such scene",
+    "fit PLATE --scene x.toml --out OUT": "no such file",
+    "fit PLATE --prior angle_zero --out OUT": "does not say of what",
+    "fit PLATE --link q=X() --out OUT": "X is not known here",
+    "fit PLATE --link q=StokesLink() --link StokesLink() --out OUT": "--link without a variable",
+    "fit PLATE --method Nuts(num_samples=9) --out OUT": "draws?",
+    "fit PLATE --method laplace --max-tree-depth 9 --out OUT": "--max-tree-depth: of --method nuts",
+    "scene --from PLATE": "it holds no result",
+    "fit PLATE --seed -1 --out OUT": "--seed",
+    "fit PLATE --largest-view-zenith 0 --out OUT": "give degrees",
+    "fit PLATE --largest-view-zenith 21 --out OUT": "only 1 valid view",
+    "fit PLATE --out /nowhere/fit.nc": "its folder is not there",
+    "effects PLATE --drop Fog": "--drop Fog: the scene has no such effect",
+    "effects PLATE --scene x": "no such scene",
+    "effects PLATE --tolerance 0": "tolerance is 0.0",
+    "fit PLATE --tolerance 0.2 --out OUT": "--tolerance needs --choose-effects",
+    "map PLATE --out OUT": "it has no axis y or x; give an image",
+    "map nowhere.zarr --out OUT": "nowhere.zarr: there is no such store",
+    "map PLATE --draws 5 --out OUT": "draws is 5; give 64, 128",
+    "map PLATE --method importance --draws 256 --out OUT": "--draws needs --method corrected-la",
+    "report PLATE --out OUT": "it holds no result",
+    "simulate --preset x --out OUT": "no such material",
+    "simulate --views 1 --out OUT": "views is 1",
+    "simulate --largest-view-zenith 90 --out OUT": "below 90",
+    "import goniometer --s x --p y --out OUT": "no such file",
+    "fit PLATE --tolerance 0.1 --out OUT": "--tolerance needs --choose-effects or --method auto",
+    "fit PLATE --seconds 5 --out OUT": "--seconds needs --method auto",
+    "fit PLATE --method auto --tolerance 7 --out OUT": "tolerance is 7.0",
+    "accuracy PLATE --method magic --out OUT": "no such method; give one of point, laplace",
+    "calibrate PLATE --simulations 3 --out OUT": "calibrate: simulations is 3; give 20 or more",
+    "calibrate PLATE --method magic --out OUT": "--method magic: no such method",
+    "map PLATE --share none --share dolp_gain --out OUT": "--share none excludes every other --sh",
 }
 
 
@@ -193,11 +186,10 @@ def test_a_mistake_gets_one_line_and_exit_status_1(
     mistake: str, plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    words, says = WRONG[mistake]
     places = {"PLATE": str(plate), "OUT": str(tmp_path / "out.nc")}
-    assert main([places.get(word, word) for word in words]) == 1
+    assert main([places.get(word, word) for word in mistake.split()]) == 1
     told = capsys.readouterr()
-    assert says in told.err
+    assert WRONG[mistake] in told.err
     assert told.err.count("\n") == 1
     assert not told.out
     assert not list(tmp_path.iterdir())

@@ -9,12 +9,23 @@ import xarray as xr
 import polar_bayes as pb
 from polar_bayes.cli import main
 
+FEW = """
+setup = "goniometer"
+
+[scene]
+surface = "SmoothSurface()"
+instrument = "Instrument((AngleZero(), BeamOverlap()))"
+"""
+"""A plate with two effects, which is quick to compile."""
+
 
 def test_effects_prints_the_ledger_and_writes_it(
     plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "ledger.nc"
-    assert main(["effects", str(plate), "--keep", "BeamOverlap", "--out", str(out)]) == 0
+    scene, out = tmp_path / "plate.toml", tmp_path / "ledger.nc"
+    scene.write_text(FEW)
+    words = ["effects", str(plate), "--scene", str(scene), "--keep", "BeamOverlap"]
+    assert main([*words, "--out", str(out)]) == 0
     head, *rows, space, sentences = capsys.readouterr().out.splitlines()
     assert head.split()[:2] == ["data", "shift"]
     assert not space

@@ -19,94 +19,17 @@ from polar_bayes.cli.wording import FUNCTIONS, KEYWORDS, as_commands
 
 ROOT = Path(__file__).parents[2]
 
-SENTENCES = {
-    "so sample longer, as in Nuts(warmup=1000, most_draws=20000), and": (
-        "so sample longer, as in --warmup 1000 --most-draws 20000, and"
-    ),
-    "raise it, as in Nuts(max_tree_depth=10).": "raise it, as in --max-tree-depth 10.",
-    "give Nuts(chains=8, draws=900).": "give --method 'Nuts(chains=8, draws=900)'.",
-    "compare Importance(draws=2048, rounds=6), or": (
-        "compare --method 'Importance(draws=2048, rounds=6)', or"
-    ),
-    "use method='importance' or 'nuts' where that matters": (
-        "use --method importance or nuts where that matters"
-    ),
-    "chains (pb.methods.Nuts()) are": "chains (--method nuts) are",
-    "give settings such as polar_bayes.methods.Nuts()": "give settings such as --method nuts",
-    "as in --method 'Nuts(most_draws=20000)', or": "as in --method 'Nuts(most_draws=20000)', or",
-    "try polar_bayes.compare_scenes.": "try polar-bayes scenes capture.nc.",
-    "or compare_scenes and then": "or polar-bayes scenes capture.nc and then",
-    "state it by setup= at import or scene=, or let scene='auto' of a fit choose.": (
-        "state it by --setup at import or --scene, or let --scene auto of a fit choose."
-    ),
-    "beyond, give priors={'refractive_index': TruncatedNormal(2, 0.3, low=1)}.": (
-        "beyond, give --prior 'refractive_index=TruncatedNormal(2, 0.3, low=1)'."
-    ),
-    "priors['bend']: it has no prior; give one: priors={'bend': <a NumPyro distribution>}": (
-        "--prior bend: it has no prior; give one: --prior 'bend=DISTRIBUTION'"
-    ),
-    "truncate it, for example TruncatedNormal(..., low=1)": (
-        "truncate it, for example --prior 'NAME=TruncatedNormal(..., low=1)'"
-    ),
-    "links['dop']: no link": "--link dop: no link",
-    "give a link such as BetaLink(), or a mapping {'dop': BetaLink()}": (
-        "give a link such as BetaLink(), or --link 'dop=BetaLink()'"
-    ),
-    "Links: q by StokesLink(stated_errors=True); dop by BetaLink().": (
-        "Links: --link 'q=StokesLink(stated_errors=True)'; --link 'dop=BetaLink()'."
-    ),
-    "Links: dop by BetaLink(margin=0.1, schedule=ConcentrationSchedule(minimum=5.0)).": (
-        "Links: --link 'dop=BetaLink(margin=0.1, schedule=ConcentrationSchedule(minimum=5.0))'."
-    ),
-    "Angles set by: hand; the prior of angle_zero is Normal(loc=0, scale=0.75).": (
-        "Angles set by: hand; its prior is --prior 'angle_zero=Normal(loc=0, scale=0.75)'."
-    ),
-    "StokesLink(stated_errors=True): no q_error; add it or use stated_errors=False": (
-        "--link 'StokesLink(stated_errors=True)': no q_error; add it or use "
-        "--link 'StokesLink(stated_errors=False)'"
-    ),
-    "check it, or mark it valid=False.": "check it, or mark it 0 in column valid.",
-    "8 of 20 readings are marked valid=False": "8 of 20 readings are marked 0 in column valid",
-    "correct it or mark it valid=False, as by capture['valid'] = capture['q'].notnull()": (
-        "correct it or mark it 0 in column valid"
-    ),
-    "fit_pixels: shared='roughness': an image cannot share it": (
-        "map: --share roughness: an image cannot share it"
-    ),
-    "let each pixel have its own: shared=(), or": "let each pixel have its own: --share none, or",
-    "drop='Fog': the scene has no such effect": "--drop Fog: the scene has no such effect",
-    "leave it out of all with drop=['q'], in a command --drop q": (
-        "leave it out of all with --drop q"
-    ),
-    "drop the label with drop_vars('tone')": "drop the label with --drop tone",
-    "use table= and name the columns angle=, s= and p=": (
-        "use --table and name the columns --angle, --s and --p"
-    ),
-    "give captures joined by polar_bayes.capture.combine, or use model='per_material'": (
-        "give captures joined by polar-bayes combine, or use --model per_material"
-    ),
-    "give the tree that polar_bayes.fit or load returned": (
-        "give the file that polar-bayes fit wrote"
-    ),
-    "give what polar_bayes.calibrate returns": "give what polar-bayes calibrate wrote",
-    "give the file that polar_bayes.save or a command wrote": "give the file that a command wrote",
-    "polar-bayes import table a.csv --out a.nc, or pb.from_table('a.csv')": (
-        "polar-bayes import table a.csv --out a.nc"
-    ),
-    "average a region first, for example capture.mean(('y', 'x'))": (
-        "average a region first, or fit each pixel with polar-bayes map"
-    ),
-    "a model of your own goes with pb.fit only": "a model of your own is fitted in Python only",
-    "a shape=3, p = 0.02 and refractive_index near 1.5": (
-        "a shape=3, p = 0.02 and refractive_index near 1.5"
-    ),
-}
+SENTENCES = [
+    tuple(pair.splitlines())
+    for pair in Path(__file__).with_name("wording.txt").read_text().split("\n\n")
+]
+"""Each sentence as Python says it, and as commands do."""
 
 
-@pytest.mark.parametrize("python", SENTENCES)
-def test_advice_names_options_and_commands(python: str) -> None:
+@each(("python", "command"), SENTENCES)
+def test_advice_names_options_and_commands(python: str, command: str) -> None:
     said = as_commands(python)
-    assert said == SENTENCES[python]
+    assert said == command
     assert as_commands(said) == said
 
 

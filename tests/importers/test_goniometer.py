@@ -263,16 +263,8 @@ OPTIONS = [
     ({"s": GOOD, "p": GOOD, "s_incident": 9, "p_incident": np.nan}, "p_incident: it is nan", "0 <"),
     ({"s": GOOD, "p": GOOD, "s_error": 0.0}, "s_error: it is 0.0", "give 1e-30 <= value"),
     ({"s": GOOD, "p": GOOD, "p_error": np.inf}, "p_error: it is inf", "give 1e-30 <= value"),
-    (
-        {"s": GOOD, "p": GOOD, "relative_error": -0.1},
-        "relative_error: it is -0.1",
-        "0 <= value < 1",
-    ),
-    (
-        {"s": GOOD, "p": GOOD, "relative_error": "1%"},
-        "relative_error: it is '1%'",
-        "0 <= value < 1",
-    ),
+    ({"s": GOOD, "p": GOOD, "relative_error": -0.1}, "relative_error: it is -0.1", "0 <= value"),
+    ({"s": GOOD, "p": GOOD, "relative_error": "1%"}, "relative_error: it is '1%'", "value < 1"),
     ({"s": GOOD, "p": GOOD, "dark_level": np.nan}, "dark_level: it is nan", "value < 1e+30"),
     ({"s": GOOD, "p": GOOD, "dark_level": 10**400}, "dark_level: it is 1000", "value < 1e+30"),
     ({"s": GOOD, "p": GOOD, "wavelength": 0.0}, "wavelength: it is 0.0", "give 0 < value"),
@@ -284,19 +276,11 @@ OPTIONS = [
     ({"s": GOOD, "p": (np.ones((2, 2)), np.ones((2, 2)))}, "p: it holds more than", "one finite"),
     ({"s": ([1, 2], [1]), "p": GOOD}, "s: 2 angles and 1 readings", "one angle for each reading"),
     ({"s": ([], []), "p": GOOD}, "s: it holds|s: 0 angles", "one"),
-    (
-        {"s": ([40, 90], [1, 2]), "p": GOOD},
-        "s[row=1]: the angle is outside 0 <= value < 90",
-        "surf",
-    ),
+    ({"s": ([40, 90], [1, 2]), "p": GOOD}, "s[row=1]: the angle is outside 0 <= value <", "surf"),
     ({"s": GOOD, "p": ([-1, 50], [1, 2])}, "p[row=0]: the angle is outside", "the surface normal"),
     ({"s": ([40, 50, 40], [1, 2, 3]), "p": GOOD}, "s[row=2]: s was read at this angle", "average"),
     ({"s": ([40, 50], [1, 1e31]), "p": GOOD}, "s[row=1]: the reading is too large", "below 1e+30"),
-    (
-        {"s": ([40, 50], [1, -9]), "p": GOOD},
-        "s[row=1]: the reading lies below the dark",
-        "as s_err",
-    ),
+    ({"s": ([40, 50], [1, -9]), "p": GOOD}, "s[row=1]: the reading lies below the", "as s_err"),
     (
         {"s": GOOD, "p": GOOD, "s_incident": 2.4, "p_incident": 9.0},
         "s[row=1]: more light comes back than went in (angle 50, s 3)",
@@ -339,9 +323,8 @@ def test_measured_glass_is_close_to_fresnel(measured):
     assert int(capture["interpolated"].sum()) == 24
     S, P = fresnel(capture["view_zenith"].values, 1.509)
     deviation = np.abs(capture["q"] - (S - P) / (S + P))
-    assert (
-        float(deviation.max()) < 0.06
-    )  # systematic errors dominate: the detector sees some s as p
+    # Systematic errors dominate: the detector sees some s as p.
+    assert float(deviation.max()) < 0.06
 
 
 @pytest.mark.thorough

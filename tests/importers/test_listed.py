@@ -146,8 +146,8 @@ REFUSED = [
     (
         PLAIN,
         {"columns": {"dop": "intensity"}},
-        "column dop: dop is the column 'intensity', too",
-        "ignore one of both",
+        "dop is the column 'intensity', too",
+        "ignore one of",
     ),
     ("view_zenith,DoLP\n10,.1\n", {}, "column DoLP: a capture has no variable", "say what it is"),
     (

@@ -141,13 +141,6 @@ def test_a_rim_tells_its_sphere(row, column, radius, around):
 
 
 @pytest.mark.thorough
-def test_a_rim_may_stand_in_a_table(tmp_path):
-    (tmp_path / "rim.csv").write_text("row,column\n10,50\n50,90\n90,50\n50,10\n")
-    found = fit_sphere(tmp_path / "rim.csv")
-    np.testing.assert_allclose([found.row, found.column, found.radius], [50.0, 50.0, 40.0])
-
-
-@pytest.mark.thorough
 @each(
     ("rim", "said"),
     [

@@ -59,14 +59,6 @@ def test_turning_axes_is_a_rotation(q, u, degrees, correlation, ratio):
     np.testing.assert_allclose(turn @ [q, u], [after.q[0, 0], after.u[0, 0]], atol=1e-12)
 
 
-@pytest.mark.thorough
-def test_light_along_an_angle_is_q_in_axes_turned_by_it():
-    along = image(np.cos(np.deg2rad(60.0)), np.sin(np.deg2rad(60.0)), 1.0, 1.0, 0.0)  # at 30
-    rotated = along.rotated(np.cos(np.deg2rad(60.0)), np.sin(np.deg2rad(60.0)))
-    assert rotated.q[0, 0] == pytest.approx(1.0)
-    assert rotated.u[0, 0] == pytest.approx(0.0, abs=1e-12)
-
-
 def test_covariance_is_that_of_many_drawn_readings():
     """40,000 draws with unequal noise; within five standard errors, sqrt(2/40000) of each."""
     rng = np.random.default_rng(1)

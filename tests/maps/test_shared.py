@@ -132,33 +132,26 @@ def test_a_setup_says_what_its_images_share(
     assert not pb.maps.shared_cautions(found)
 
 
-@pytest.mark.parametrize("case", ["asked", "small", "disagreeing"])
 def test_pixels_keep_their_own_where_nothing_should_be_shared(
-    image: xr.Dataset, monkeypatch: pytest.MonkeyPatch, case: str
-) -> None:
-    asked: dict = {"shared": ()} if case == "asked" else {}
-    if case != "small":
-        monkeypatch.setattr(fit_map, "SHARED_PIXELS", 4 if case == "asked" else SIDE**2)
-    corner = image.isel(y=slice(2), x=slice(2))
-    image = noisy(HALVES) if case == "disagreeing" else corner
-    maps = pb.fit_pixels(image, scene=SETUP, **asked)
-    assert pb.maps.shared_parameters(maps).empty
-    assert "stokes_error_factor" in maps
-    cautions = pb.maps.shared_cautions(maps)
-    assert len(cautions) == (case == "disagreeing")
-    assert all("one value should serve the whole image, but pixels do" in x for x in cautions)
-
-
-def test_a_finished_map_whose_pixels_disagree_is_returned(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """In a small image, where the caller says so, and where pixels disagree, which is told."""
+    image = noisy(HALVES)
+    small = pb.fit_pixels(image, scene=SETUP)
     monkeypatch.setattr(fit_map, "SHARED_PIXELS", SIDE**2)
-    noisy(HALVES).to_zarr(tmp_path / "image.zarr", consolidated=False)
+    asked = pb.fit_pixels(image, scene=SETUP, shared=())
+    image.to_zarr(tmp_path / "image.zarr", consolidated=False)
     paths = tmp_path / "image.zarr", tmp_path / "map.zarr"
-    first = pb.maps.map_file(*paths, scene=SETUP).load()
-    assert pb.maps.shared_cautions(first)
+    disagreeing = pb.maps.map_file(*paths, scene=SETUP).load()
+    for maps in (small, asked, disagreeing):
+        assert pb.maps.shared_parameters(maps).empty
+        for name in ("stokes_error_factor", "refractive_index_sd"):
+            np.testing.assert_array_equal(maps[name], asked[name])
+    assert not pb.maps.shared_cautions(small) + pb.maps.shared_cautions(asked)
+    (caution,) = pb.maps.shared_cautions(disagreeing)
+    assert "one value should serve the whole image, but pixels do" in caution
     again = pb.maps.map_file(*paths, scene=SETUP, resume=True)
-    xr.testing.assert_identical(again.load(), first)
+    xr.testing.assert_identical(again.load(), disagreeing)
 
 
 def test_another_number_of_draws_compiles_nothing() -> None:

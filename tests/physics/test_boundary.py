@@ -56,18 +56,6 @@ def test_what_is_not_reflected_passes(theta: float, first: float, second: float)
     np.testing.assert_allclose(s_and_p(reflected) + s_and_p(passed), 1.0, atol=3e-14)
 
 
-@pytest.mark.thorough
-@given(theta=zenith, first=index, second=index)
-@RUN
-def test_as_much_passes_upwards_as_downwards(theta: float, first: float, second: float) -> None:
-    b = sin_degrees(theta) ** 2
-    above, below = media(theta, first, second)
-    for law in (boundary.reflection, boundary.transmission):
-        there, back = law(above, below, b), law(below, above, b)
-        for one, other in zip(there, back, strict=True):
-            np.testing.assert_allclose(one, other, rtol=1e-14)
-
-
 @each("theta", [0.0, 1e-6, 1.0, 40.0, 56.3, 75.0, 89.0, 89.999])
 @each("indexes", [(1.0, 1.5), (1.0, 1.0 + 1e-6), (1.4, 1.6), (1.6, 1.4), (1.5, 1.5001), (2.4, 1.0)])
 def test_no_digit_is_lost_against_eighty(theta: float, indexes: tuple[float, float]) -> None:
@@ -96,24 +84,6 @@ def test_no_digit_is_lost_against_eighty(theta: float, indexes: tuple[float, flo
                 assert abs(mp.mpf(float(value)) * b**power_of_b - true) <= 1e-12 * abs(true)
 
 
-def test_no_p_light_at_the_brewster_angle_of_two_media() -> None:
-    """tan of the angle in the upper medium is the ratio of the indexes."""
-    n, m = 1.3, 1.6
-    b = (n * np.sin(np.arctan(m / n))) ** 2
-    above, below = (boundary.medium(jnp.asarray(x), 1.0 - b) for x in (n, m))
-    _, p = s_and_p(boundary.reflection(above, below, b))
-    assert abs(p) < 1e-17
-
-
-@each("n", [1.0, 1.5])
-def test_alike_media_have_no_boundary(n: float) -> None:
-    b = sin_degrees(50.0) ** 2
-    above, below = media(50.0, n, n)
-    np.testing.assert_array_equal(s_and_p(boundary.reflection(above, below, b)), 0.0)
-    np.testing.assert_allclose(s_and_p(boundary.transmission(above, below, b)), 1.0, rtol=1e-15)
-    assert boundary.relative_reflection(above, below, b).mean > 0.0
-
-
 @given(theta=zenith, layers=st.lists(film, min_size=1, max_size=3), body=index)
 @settings(parent=RUN, max_examples=100)
 def test_films_agree_with_characteristic_matrices(theta: float, layers: list, body: float) -> None:
@@ -136,46 +106,6 @@ def test_a_film_turns_passing_light_as_its_fields_do(
     _, fields, through = twin.films(1.0, [layer], body, float(sin_degrees(theta) ** 2))
     cross = fields[0] * np.conj(fields[1]) * np.sqrt(np.prod(through / np.abs(fields) ** 2))
     np.testing.assert_allclose(passed.cross, cross.real, atol=1e-12)
-
-
-@pytest.mark.thorough
-@given(theta=zenith, layers=st.lists(film, min_size=1, max_size=3), body=index)
-@RUN
-def test_clear_films_lose_no_light(theta: float, layers: list, body: float) -> None:
-    reflected, passed = filmed(theta, layers, body)
-    np.testing.assert_allclose(s_and_p(reflected) + s_and_p(passed), 1.0, atol=1e-12)
-
-
-@given(theta=zenith, n=index, body=index)
-@RUN
-def test_a_film_without_thickness_is_not_there(theta: float, n: float, body: float) -> None:
-    reflected, passed = filmed(theta, [(n, 0.0)], body)
-    air, below = media(theta, 1.0, body)
-    b = sin_degrees(theta) ** 2
-    for found, law in ((reflected, boundary.reflection), (passed, boundary.transmission)):
-        np.testing.assert_allclose(s_and_p(found), s_and_p(law(air, below, b)), atol=1e-13)
-        np.testing.assert_allclose(found.cross, law(air, below, b).cross, atol=1e-13)
-
-
-@pytest.mark.thorough
-@given(theta=zenith, thickness=st.floats(0.0, 30.0), body=index)
-@RUN
-def test_a_film_like_the_body_or_like_the_air_is_not_there(
-    theta: float, thickness: float, body: float
-) -> None:
-    air, below = media(theta, 1.0, body)
-    bare = s_and_p(boundary.reflection(air, below, sin_degrees(theta) ** 2))
-    for n in (1.0, body):
-        reflected, _ = filmed(theta, [(n, thickness)], body)
-        np.testing.assert_allclose(s_and_p(reflected), bare, atol=1e-13)
-
-
-def test_a_quarter_wave_of_the_mean_index_reflects_nothing() -> None:
-    """At normal incidence, for n = sqrt(body); a half wave is not there."""
-    n, body = np.sqrt(1.7), 1.7
-    quarter, half = (filmed(0.0, [(n, turn / n)], body)[0] for turn in (np.pi / 2.0, np.pi))
-    assert abs(quarter.mean) < 1e-30
-    np.testing.assert_allclose(half.mean, (0.7 / 2.7) ** 2, rtol=1e-13)
 
 
 @pytest.mark.thorough

@@ -4,17 +4,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import each
 from scipy.integrate import quad
 
-from polar_bayes.errors import SceneError
-from polar_bayes.physics.coat import AbstractCoat, ClearCoat, CoatStack, ThinFilm
+from polar_bayes.physics.coat import AbstractCoat, ClearCoat, ThinFilm
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
 from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.stack import Layer, Stack
 from polar_bayes.physics.subsurface import Lambertian
-from polar_bayes.physics.surface import InternalReflection, RoughSurface, SmoothSurface
+from polar_bayes.physics.surface import InternalReflection, SmoothSurface
 
 stokes_of = jax.jit(Scene.stokes, static_argnums=0)
 
@@ -76,50 +74,6 @@ def test_a_film_agrees_with_the_table(thin_films: np.ndarray) -> None:
     np.testing.assert_allclose((s - p) / (s + p), dolp, atol=2e-9)
 
 
-def test_a_coat_adds_its_parameters_to_the_scene() -> None:
-    scene = Scene(RoughSurface(), coat=CoatStack((ThinFilm(), ClearCoat(1.5))))
-    assert scene.parameters == (
-        "roughness",
-        "refractive_index",
-        "coat_absorbance",
-        "film_refractive_index",
-        "film_thickness",
-    )
-    assert Scene(SmoothSurface(), coat=ClearCoat(1.5, 0.0)).parameters == ("refractive_index",)
-    named = ClearCoat("lacquer_index", "lacquer_absorbance")
-    assert named.parameters == ("lacquer_index", "lacquer_absorbance")
-
-
-@pytest.mark.thorough
-@each("surface", [SmoothSurface(), RoughSurface()], ids=["smooth", "rough"])
-def test_known_numbers_and_parameters_of_that_value_are_alike(surface: object) -> None:
-    fitted = Scene(surface, coat=CoatStack((ThinFilm(), ClearCoat())))
-    known = Scene(surface, coat=CoatStack((ThinFilm(1.38, 230.0), ClearCoat(1.45, 0.3))))
-    np.testing.assert_allclose(
-        stokes_of(fitted, MATERIAL, VIEWS), stokes_of(known, MATERIAL, VIEWS), rtol=1e-14
-    )
-
-
-@pytest.mark.thorough
-@each(
-    "coat",
-    [
-        ClearCoat(1.0, 0.0),
-        ClearCoat(1.6, 0.0),
-        ThinFilm(1.0, 300.0),
-        ThinFilm(1.6, 300.0),
-        ThinFilm(1.3, 0.0),
-        CoatStack((ThinFilm(1.6, 300.0), ClearCoat(1.6, 0.0))),
-    ],
-    ids=str,
-)
-def test_a_coat_without_effect_is_no_coat(coat: AbstractCoat) -> None:
-    body = Lambertian(0.7, InternalReflection())
-    parts = (SmoothSurface(), body, StokesMixing())
-    bare, coated = (stokes_of(Scene(*parts, coat=c), MATERIAL, VIEWS) for c in (None, coat))
-    np.testing.assert_allclose(coated, bare, rtol=1e-8, atol=1e-14)
-
-
 @pytest.mark.thorough
 def test_a_body_under_a_coat_of_its_own_index() -> None:
     """T+(l) e^(-tau/mu_l) [T+, T-](v) e^(-tau/mu_v) A/(pi n^2 (1 - A Fi_tau)).
@@ -169,42 +123,6 @@ def test_fringes_move_with_color_and_angle() -> None:
     assert np.all(np.abs(found[:, 2:, 0] / bare[None, 2:, 0] - 1.0) > 1e-3)
 
 
-@each("coat", [ThinFilm(), CoatStack((ClearCoat(), ThinFilm()))], ids=str)
-def test_a_film_needs_a_wavelength(coat: AbstractCoat) -> None:
-    scene = Scene(SmoothSurface(), coat=coat)
-    with pytest.raises(SceneError, match=r"ThinFilm: fringes .*; give the geometry a wavelength"):
-        scene.stokes(MATERIAL, VIEWS._replace(wavelength=None))
-
-
 def test_a_clear_coat_has_no_filter_in_the_program() -> None:
     assert ClearCoat(1.5, 0.0).layers({}, None) == (Layer(jnp.asarray(1.5), None, None),)
     assert ClearCoat(1.5, 0.1).layers({}, None)[0].absorbance is not None
-
-
-@pytest.mark.thorough
-def test_simpler_coats_leave_one_out() -> None:
-    film, lacquer = ThinFilm(), ClearCoat()
-    assert ClearCoat().simpler() == (None,)
-    assert CoatStack((film, lacquer)).simpler() == (CoatStack((lacquer,)), CoatStack((film,)))
-    assert CoatStack((film,)).simpler() == (None,)
-
-
-@each(
-    ("make", "message"),
-    [
-        (lambda: ClearCoat(0.5), "ClearCoat: refractive_index: 0.5 is neither a number from 1 to"),
-        (lambda: ClearCoat(absorbance=-1.0), "ClearCoat: absorbance: -1.0 is neither a number fr"),
-        (lambda: ClearCoat("two words"), "ClearCoat: refractive_index: 'two words' is neither"),
-        (lambda: ThinFilm(True), "ThinFilm: refractive_index: True is neither"),
-        (lambda: ThinFilm(thickness_nm=float("nan")), "ThinFilm: thickness_nm: nan is neither"),
-        (lambda: CoatStack(ClearCoat()), r"CoatStack: .* is no such part; give a tuple: CoatStack"),
-        (lambda: CoatStack((ClearCoat(), None)), r"CoatStack: None is no such part; give coats"),
-        (
-            lambda: CoatStack((ClearCoat(), ClearCoat(1.5))),
-            r"CoatStack: two coats read coat_absorbance; name the parameters apart: ClearCoat\(",
-        ),
-    ],
-)
-def test_coats_are_checked(make, message: str) -> None:
-    with pytest.raises(SceneError, match=message):
-        make()

@@ -1,10 +1,8 @@
 """Interfaces as triples: the algebra must be that of s, p and x taken one by one."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -55,15 +53,6 @@ def test_all_round_trips_are_the_sum_of_the_series(trip: tuple, b: float) -> Non
     np.testing.assert_allclose(found, series, rtol=1e-13)
 
 
-@given(first=triple, second=triple)
-@RUN
-def test_at_normal_incidence_s_and_p_are_alike(first: tuple, second: tuple) -> None:
-    one, two = make(first, 0.0), make(second, 0.0)
-    for power in (one.times(two), one.plus(two), one.repeated()):
-        s, p, cross = one_by_one(power)
-        assert s == p == cross
-
-
 @pytest.mark.thorough
 @given(first=triple, second=triple)
 @RUN
@@ -74,12 +63,3 @@ def test_contrast_and_shortfall_have_limits_at_normal_incidence(
     here, there = (make(first, b).times(make(second, b)).repeated() for b in (0.0, 1e-6))
     for field in ("mean", "contrast", "shortfall"):
         np.testing.assert_allclose(getattr(here, field), getattr(there, field), atol=1e-4)
-
-
-@pytest.mark.thorough
-@each("dtype", [np.float32, np.float64])
-def test_precision_and_shape_are_the_inputs(dtype: type) -> None:
-    power = Diattenuation(*(jnp.full((3, 2), x, dtype) for x in (0.3, 0.1, 0.2, 0.5)))
-    for result in (power.times(power), power.plus(power), power.repeated(), power.scaled(2.0)):
-        assert {array.dtype for array in jax.tree.leaves(result)} == {np.dtype(dtype)}
-        assert {array.shape for array in jax.tree.leaves(result)} == {(3, 2)}

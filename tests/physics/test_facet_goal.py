@@ -101,17 +101,3 @@ def test_rules_are_inside_and_whole(nodes: int) -> None:
         assert np.all(np.diff(inside) > 0.0)
         assert np.all(weight > 0.0)
         np.testing.assert_allclose(np.sum(weight), 1.0, rtol=1e-12)
-
-
-@pytest.mark.thorough
-@of_both
-@each("roughness", [1e-5, 0.01, 0.3, 1.5])
-def test_samples_reach_from_border_to_border(
-    distribution: AbstractMicrofacet, roughness: float
-) -> None:
-    share = jnp.array([1e-9, 1.0 - 1e-9])
-    limit, lower, upper = (jnp.asarray(roughness * x) for x in (2.0, -0.5, 3.0))
-    slope, _ = distribution.across(limit, roughness, share)
-    np.testing.assert_allclose(slope, [0.0, limit], atol=1e-7 * roughness)
-    slope, _ = distribution.along(lower, upper, slope[:1], roughness, share)
-    np.testing.assert_allclose(slope, [lower, upper], rtol=1e-6)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from cases import each
 
-from polar_bayes.errors import SceneError
 from polar_bayes.physics.facets import FacetQuadrature, Microsurface, seen
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import UniformSky
@@ -36,18 +35,6 @@ def polarization(surface: RoughSurface, views: Geometry) -> np.ndarray:
     return np.stack(both(MATERIAL))
 
 
-@pytest.mark.thorough
-@each("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
-def test_thirty_facets_are_enough(distribution: Beckmann | GGX) -> None:
-    """The default, 6 x 5, is within .001 in degree of polarization; 16 x 16 within 3e-5."""
-    truth, default, fine = (
-        polarization(RoughSurface(distribution, UniformSky(), FacetQuadrature(*nodes)), VIEWS)
-        for nodes in ((40, 40), (), (16, 16))
-    )
-    assert np.max(np.abs(default - truth)) < 1e-3
-    assert np.max(np.abs(fine - truth)) < 3e-5
-
-
 @each("side", [1.0, -1.0])
 @each("zenith", [0.0, 30.0, 80.0])
 def test_no_facet_turns_its_back(zenith: float, side: float) -> None:
@@ -68,11 +55,3 @@ def test_both_sides_of_the_normal_are_alike(distribution: Beckmann | GGX) -> Non
         polarization(surface, VIEWS._replace(view_zenith=side * ANGLES)) for side in (1.0, -1.0)
     )
     np.testing.assert_allclose(left, right, atol=1e-12)
-
-
-@each("nodes", [{"along": 0}, {"across": 65}, {"along": 2.5}])
-def test_nodes_are_checked(nodes: dict) -> None:
-    with pytest.raises(
-        SceneError, match=r"FacetQuadrature: .* is no number of nodes; give a whole"
-    ):
-        FacetQuadrature(**nodes)

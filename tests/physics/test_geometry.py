@@ -35,14 +35,6 @@ def test_angles_broadcast_to_one_shape_and_one_float() -> None:
     assert geometry.wavelength is None
 
 
-@pytest.mark.thorough
-def test_a_lone_angle_is_one_view() -> None:
-    geometry = Geometry.from_degrees(
-        view_zenith=10.0, view_azimuth=180.0, light_zenith=10.0, light_azimuth=0.0
-    )
-    assert geometry.view_zenith.shape == (1,)
-
-
 def test_single_precision_stays_single() -> None:
     angle = np.float32([10.0, 20.0])
     geometry = Geometry.from_degrees(
@@ -63,45 +55,6 @@ def test_sine_and_cosine_in_degrees(angle: float) -> None:
     complement = np.float64(90.0 - angle)
     np.testing.assert_allclose(sin_degrees(angle), np.sin(np.deg2rad(angle)), rtol=3e-16)
     np.testing.assert_allclose(cos_degrees(angle), np.sin(np.deg2rad(complement)), rtol=3e-16)
-
-
-@given(view=zenith, light=zenith, difference=azimuth)
-@settings(deadline=None, max_examples=60)
-def test_mirror_facet_agrees_with_vectors(view: float, light: float, difference: float) -> None:
-    v = np.array([np.sin(np.deg2rad(view)), 0.0, np.cos(np.deg2rad(view))])
-    phi, theta = np.deg2rad(difference), np.deg2rad(light)
-    towards = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
-    half = v + np.array(towards)
-    half /= np.linalg.norm(half)
-    in_plane, across = half[2] * v[0] - half[0] * v[2], half[1]
-    found = mirror_facet(at(view, light, difference))
-    np.testing.assert_allclose(found.cos_incidence[0], v @ half, atol=1e-13)
-    tilt = (half[0] ** 2 + half[1] ** 2) / half[2] ** 2
-    np.testing.assert_allclose(found.tan_squared_tilt[0], tilt, rtol=1e-9, atol=1e-13)
-    np.testing.assert_allclose(found.along_s[0], in_plane**2 - across**2, atol=1e-13)
-    np.testing.assert_allclose(found.across_s[0], 2 * in_plane * across, atol=1e-13)
-
-
-@pytest.mark.thorough
-@given(view=zenith, light=zenith, difference=azimuth)
-@settings(deadline=None, max_examples=60)
-def test_the_turned_axes_have_the_length_of_the_sine(
-    view: float, light: float, difference: float
-) -> None:
-    facet = mirror_facet(at(view, light, difference))
-    length = jnp.hypot(facet.along_s, facet.across_s)
-    np.testing.assert_allclose(length, facet.sin_squared, rtol=1e-10, atol=1e-30)
-    np.testing.assert_allclose(facet.cos_incidence**2 + facet.sin_squared, 1.0, rtol=1e-14)
-
-
-@given(view=zenith, light=zenith, difference=azimuth, turn=st.floats(-720.0, 720.0))
-@settings(deadline=None, max_examples=40)
-def test_turning_viewer_and_light_together_changes_nothing(
-    view: float, light: float, difference: float, turn: float
-) -> None:
-    here, there = (mirror_facet(at(view, light, difference, t)) for t in (0.0, turn))
-    for one, other in zip(here, there, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
 @given(view=zenith, light=zenith, difference=azimuth)
@@ -148,16 +101,6 @@ def test_turn_between_frames_agrees_with_vectors(
     if 1e-12 < sin_squared < 1.0 - 1e-12:  # the facet's own axis is defined
         stokes = twin.mirrored((1.0, 1.0, 1.0), *ends, (1.0, 0.0))
         np.testing.assert_allclose([cos, -sin], stokes[1:], atol=1e-9)
-
-
-@pytest.mark.thorough
-@each("angle", [0.0, 1e-9, 30.0, 89.0])
-def test_frames_turn_smoothly_where_viewer_and_light_coincide(angle: float) -> None:
-    here, there = (
-        np.ravel(turn_between_frames(at(angle, angle, difference))) for difference in (0.0, 1e-7)
-    )
-    np.testing.assert_allclose(here, [1.0, 0.0], atol=1e-15)
-    np.testing.assert_allclose(there, here, atol=1e-8)
 
 
 @pytest.mark.thorough

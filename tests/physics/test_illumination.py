@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from cases import each
 
-from polar_bayes.errors import SceneError
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
@@ -147,29 +146,3 @@ def test_a_small_disc_is_a_point() -> None:
     solid_angle = 2.0 * np.pi * (1.0 - np.cos(np.deg2rad(0.1)))
     # The source's radiance is spread over its solid angle, so irradiance is cosine-weighted.
     np.testing.assert_allclose(disc / solid_angle, point, rtol=1e-4, atol=1e-9)
-
-
-@pytest.mark.thorough
-@each("source", [UniformSky(), Disc(15.0)])
-def test_a_smooth_surface_mirrors_an_extended_source(source: UniformSky | Disc) -> None:
-    material = {"roughness": 0.0, "refractive_index": 1.5}
-    geometry = viewed(np.array([1.0, 30.0, 56.0, 70.0]))
-    found = stokes_of(Scene(RoughSurface(Beckmann(), source)), material, geometry)
-    mirror = stokes_of(Scene(SmoothSurface()), material, geometry)
-    # The broadened Gaussian of the sampling is integrated by six nodes, to 3e-5.
-    np.testing.assert_allclose(found, mirror, rtol=1e-4, atol=1e-9)
-
-
-@pytest.mark.thorough
-def test_a_narrow_disc_takes_in_what_a_beam_does() -> None:
-    stack, geometry = Stack(jnp.array([[1.5]])), viewed(np.array([40.0]))
-    solid_angle = 2.0 * np.pi * (1.0 - np.cos(np.deg2rad(0.5)))
-    disc = Disc(0.5).entering(stack, geometry, {}).intensity / solid_angle
-    beam = PointSource().entering(stack, geometry, {}).intensity
-    np.testing.assert_allclose(disc, beam, rtol=1e-4)
-
-
-@each("half_width", [0.0, -1.0, 91.0, float("nan")])
-def test_half_width_is_checked(half_width: float) -> None:
-    with pytest.raises(SceneError, match=r"Disc: half_width=.* give degrees from 0.01 to 90"):
-        Disc(half_width)

@@ -2,7 +2,6 @@
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from cases import each
 
 from polar_bayes.physics.coat import ClearCoat
@@ -12,9 +11,7 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.subsurface import (
     Depolarizer,
-    DiffuseBody,
     Lambertian,
-    Unpolarized,
     half_space_loss,
 )
 from polar_bayes.physics.surface import Interface, InternalReflection, SmoothSurface
@@ -24,20 +21,6 @@ VIEWS = Geometry.from_degrees(
 )
 MATERIAL = {"refractive_index": jnp.array([1.5]), "absorption": jnp.array([0.3])}
 INTERFACE = Interface(SmoothSurface(), Stack(MATERIAL["refractive_index"]))
-BODIES = each("body", [Lambertian, Unpolarized])
-
-
-@pytest.mark.thorough
-@BODIES
-@each("albedo", [0.0, 0.3, 0.9, 1.0])
-def test_light_comes_out_after_any_number_of_round_trips(body: type, albedo: float) -> None:
-    """The closed form against 400 terms of the series; n^2 spreads the light over air."""
-    inside = 1.0 - float(INTERFACE.stack.escape()[0])
-    series = np.sum((albedo * inside) ** np.arange(400)) / 1.5**2
-    once = body(albedo).light(MATERIAL, VIEWS, INTERFACE)
-    all_trips = body(albedo, InternalReflection()).light(MATERIAL, VIEWS, INTERFACE)
-    np.testing.assert_allclose(all_trips.intensity, series * once.intensity, rtol=1e-12)
-    np.testing.assert_array_equal(all_trips.q, once.q)
 
 
 @each("coat", [None, ClearCoat(1.3, 0.0), ClearCoat(1.9, 0.0)], ids=str)
@@ -72,16 +55,3 @@ def test_without_it_a_depolarizer_keeps_what_a_half_space_loses() -> None:
     np.testing.assert_allclose(once.q, lost * leaving.q, rtol=1e-14)
     # Light that is turned back is scattered again: brighter and less polarized.
     assert np.all(all_trips.intensity > once.intensity)
-
-
-@pytest.mark.thorough
-def test_the_part_can_be_left_out() -> None:
-    assert InternalReflection().simpler() == (None,)
-    assert isinstance(Lambertian(0.5, InternalReflection()), DiffuseBody)
-
-
-@pytest.mark.thorough
-def test_a_simpler_lambertian_keeps_its_round_trips() -> None:
-    assert Lambertian(0.5, InternalReflection()).simpler() == (
-        Unpolarized(0.5, InternalReflection()),
-    )

@@ -1,19 +1,16 @@
 """Facets as a population: their density covers the surface, their shares are those of vectors."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 import vector_optics as twin
 from cases import each
 
-from polar_bayes.physics.facets import FacetQuadrature, Microsurface, seen
+from polar_bayes.physics.facets import FacetQuadrature, Microsurface
 from polar_bayes.physics.geometry import Geometry, mirror_facet
 from polar_bayes.physics.microfacet import (
     GGX,
     AnisotropicSlopes,
     Beckmann,
-    IsotropicSlopes,
     SeparableShadowing,
     SlopeEllipse,
 )
@@ -90,36 +87,3 @@ def test_visible_shares_of_grooves_agree_with_vectors(name: str) -> None:
     tangent = np.tan(np.deg2rad(zenith))
     found = surface(name, ellipse).visible(tangent * np.cos(turn), tangent * np.sin(turn))
     np.testing.assert_allclose(found, population.visible(rays), rtol=1e-12)
-
-
-@pytest.mark.thorough
-@named
-@each("view", [0.0, 40.0, 80.0])
-def test_seen_facets_show_the_area_of_the_plane(name: str, view: float) -> None:
-    """The weights sum to cos(v)/G1(v); Beckmann's G1 is a fit within .6 %."""
-    geometry = Geometry.from_degrees(
-        view_zenith=view, view_azimuth=10.0, light_zenith=0.0, light_azimuth=0.0
-    )
-    for slopes in (IsotropicSlopes(), AnisotropicSlopes(35.0)):
-        ellipse = jax.tree.map(jnp.atleast_1d, slopes.ellipse(roughness(0.4, 0.15), geometry))
-        facets = surface(name, ellipse, FacetQuadrature(40, 40))
-        area = np.sum(facets.sample(geometry, seen).weight)
-        shares = facets.visible(jnp.tan(jnp.deg2rad(view)), 0.0)
-        bound = 6e-3 if name == "Beckmann" else 3e-4
-        np.testing.assert_allclose(area * shares / np.cos(np.deg2rad(view)), 1.0, rtol=bound)
-
-
-@pytest.mark.thorough
-@named
-def test_equal_roughnesses_have_the_isotropic_density_and_share(name: str) -> None:
-    geometry = Geometry(*(jnp.asarray(x) for x in ([30.0], [0.0], [60.0], [140.0])))
-    tilt = mirror_facet(geometry).tan_squared_tilt
-    same = roughness(0.3, 0.3)
-    one, other = (
-        surface(name, slopes.ellipse(same, geometry))
-        for slopes in (IsotropicSlopes(), AnisotropicSlopes(35.0))
-    )
-    np.testing.assert_allclose(
-        other.density(geometry, tilt), one.density(geometry, tilt), rtol=1e-12
-    )
-    np.testing.assert_allclose(other.visible(2.0, 1.0), one.visible(2.0, 1.0), rtol=1e-13)

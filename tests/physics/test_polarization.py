@@ -9,10 +9,9 @@ from cases import each
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from polar_bayes.errors import SceneError
 from polar_bayes.physics.coat import ClearCoat, ThinFilm
 from polar_bayes.physics.geometry import Geometry, cos_degrees
-from polar_bayes.physics.illumination import PointSource, UniformSky
+from polar_bayes.physics.illumination import PointSource
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import LinearPolarization, to_stokes
@@ -29,7 +28,6 @@ index = st.floats(1.01, 3.0)
 BEAM = PointSource(LinearPolarization("degree", "angle"))
 MIRROR = Scene(SmoothSurface(BEAM))
 stokes_of = jax.jit(Scene.stokes, static_argnums=0)
-BREWSTER = float(np.rad2deg(np.arctan(1.5)))
 
 
 def at(view: tuple[float, float], light: tuple[float, float]) -> Geometry:
@@ -112,87 +110,6 @@ def mueller(view: tuple, light: tuple, n: float, scene: Scene = MIRROR) -> np.nd
     return np.stack([none, 0.5 * (s - p), diagonal - none], axis=1)
 
 
-@given(view=direction, light=direction, n=index)
-@RUN
-def test_no_light_that_is_possible_becomes_impossible(view: tuple, light: tuple, n: float) -> None:
-    """S0 >= |S| for every incident state, and the answer is linear in it."""
-    matrix = mueller(view, light, n)
-    turn = np.deg2rad(np.linspace(0.0, 360.0, 73))
-    states = np.stack([np.ones(73), np.cos(turn), np.sin(turn)])
-    out = matrix @ states
-    assert np.all(out[0] >= -1e-15)
-    assert np.all(np.hypot(out[1], out[2]) <= out[0] + 1e-13 * matrix[0, 0])
-    direct = mirrored(view, light, n, 0.7, 33.0)
-    q, u = components(0.7, 33.0)
-    np.testing.assert_allclose(direct, matrix @ [1.0, q, u], atol=1e-13 * matrix[0, 0] + 1e-300)
-
-
-@given(view=direction, light=direction, n=index)
-@RUN
-def test_viewer_and_light_may_change_places(view: tuple, light: tuple, n: float) -> None:
-    """Helmholtz: the matrix of the way back is the transpose; of a rough surface, over cosines."""
-    forth, back = mueller(view, light, n), mueller(light, view, n)
-    np.testing.assert_allclose(back, forth.T, atol=1e-12 * forth[0, 0])
-    rough = Scene(RoughSurface(illumination=BEAM))
-    forth, back = mueller(view, light, n, rough), mueller(light, view, n, rough)
-    cosines = np.cos(np.deg2rad(view[0])) / np.cos(np.deg2rad(light[0]))
-    np.testing.assert_allclose(back / cosines, forth.T, atol=1e-9 * forth[0, 0] + 1e-300)
-
-
-def test_at_brewsters_angle_s_light_is_reflected_and_p_light_is_not() -> None:
-    view, light = (BREWSTER, 180.0), (BREWSTER, 0.0)
-    power = ((1.5**2 - 1.0) / (1.5**2 + 1.0)) ** 2
-    s, p = (mirrored(view, light, 1.5, 1.0, a) for a in (0.0, 90.0))
-    np.testing.assert_allclose(s, [power, power, 0.0], atol=1e-15)
-    np.testing.assert_allclose(p, 0.0, atol=1e-16)
-    plain = mirrored(view, light, 1.5, 0.0, 0.0)
-    np.testing.assert_allclose(plain, [0.5 * power, 0.5 * power, 0.0], atol=1e-15)
-
-
-@pytest.mark.thorough
-@given(va=azimuth, la=azimuth, degree=degree, angle=angle)
-@RUN
-def test_at_normal_incidence_the_field_keeps_its_direction_in_the_laboratory(
-    va: float, la: float, degree: float, angle: float
-) -> None:
-    """Both axes turn with the azimuth of their ray, so only the difference of azimuths counts."""
-    q, u = components(degree, la - va + angle)
-    found = mirrored((0.0, va), (0.0, la), 1.5, degree, angle)
-    np.testing.assert_allclose(found, 0.04 * np.array([1.0, q, u]), atol=1e-13)
-
-
-@pytest.mark.thorough
-@given(incidence=st.floats(0.0, 85.0), degree=degree, angle=angle)
-@RUN
-def test_in_the_plane_of_incidence_diagonal_light_keeps_its_share(
-    incidence: float, degree: float, angle: float
-) -> None:
-    """q mixes with the difference of s and p; u is multiplied by r_s r_p.
-
-    On the mirror side both axes look the other way: u changes sign at Brewster's angle only.
-    """
-    found = mirrored((incidence, 180.0), (incidence, 0.0), 1.5, degree, angle)
-    s, p, cross = np.real(twin.bare(1.5, float(np.sin(np.deg2rad(incidence)) ** 2)))
-    q, u = components(degree, angle)
-    expected = [
-        0.5 * (s + p) + 0.5 * (s - p) * q,
-        0.5 * (s - p) + 0.5 * (s + p) * q,
-        cross * u,
-    ]
-    np.testing.assert_allclose(found, expected, atol=1e-14)
-
-
-@pytest.mark.thorough
-@each("v", [0.0, 1e-3, 40.0, 85.0])
-def test_nothing_jumps_where_viewer_and_light_coincide(v: float) -> None:
-    """The mirror facet looks at both: its s axis is undefined there, but no reading is."""
-    here = mirrored((v, 20.0), (v, 20.0), 1.5, 0.8, 25.0)
-    np.testing.assert_allclose(here[0], 0.04, rtol=1e-13)
-    for dv, da in ((1e-6, 0.0), (0.0, 1e-6), (-1e-6, 1e-6), (1e-6, -1e-6)):
-        near = mirrored((v + dv, 20.0 + da), (v, 20.0), 1.5, 0.8, 25.0)
-        np.testing.assert_allclose(near, here, atol=1e-8)
-
-
 @pytest.mark.thorough
 @each("view", [(0.0, 20.0), (40.0, 20.0), (85.0, 20.0), (40.0, 200.0)], ids=str)
 @each("dtype", [np.float64, np.float32])
@@ -234,33 +151,3 @@ def test_what_enters_is_what_the_transmittances_of_s_and_p_let_through(
     ]
     found = np.asarray(to_stokes(light))[0] / cos_degrees(incidence)
     np.testing.assert_allclose(found, expected, atol=1e-13)
-
-
-@pytest.mark.thorough
-def test_p_light_enters_a_body_whole_at_brewsters_angle() -> None:
-    source = PointSource(LinearPolarization(1.0, 90.0))
-    light = source.entering(Stack(jnp.array([1.5])), at((0.0, 0.0), (BREWSTER, 0.0)), {})
-    np.testing.assert_allclose(light.intensity, np.cos(np.deg2rad(BREWSTER)), rtol=1e-14)
-    np.testing.assert_allclose(light.q, -1.0, rtol=1e-14)
-
-
-def test_polarization_adds_its_parameters_and_can_be_left_out() -> None:
-    assert MIRROR.parameters == ("refractive_index", "degree", "angle")
-    assert Scene(RoughSurface(illumination=BEAM)).parameters[-2:] == ("degree", "angle")
-    assert PointSource(LinearPolarization(0.5, 10.0)).parameters == ()
-    assert LinearPolarization().simpler() == (None,)
-
-
-@each(
-    ("make", "message"),
-    [
-        (lambda: LinearPolarization(1.5), "LinearPolarization: degree: 1.5 is neither a number fr"),
-        (lambda: LinearPolarization(1.0, 200.0), "LinearPolarization: angle: 200.0 is neither"),
-        (lambda: LinearPolarization("a b"), "LinearPolarization: degree: 'a b' is neither"),
-        (lambda: PointSource(0.5), "PointSource: polarization: 0.5 is no such part; give Linear"),
-        (lambda: PointSource(UniformSky()), "PointSource: polarization: .* is no such part"),
-    ],
-)
-def test_polarizations_are_checked(make, message: str) -> None:
-    with pytest.raises(SceneError, match=message):
-        make()

@@ -24,8 +24,8 @@ from polar_bayes.physics.instrument import (
     Instrument,
 )
 from polar_bayes.physics.microfacet import GGX, AnisotropicSlopes
-from polar_bayes.physics.mixing import DopMixing, StokesMixing
-from polar_bayes.physics.scene import MATERIAL_PARAMETERS, SCENES, Scene
+from polar_bayes.physics.mixing import StokesMixing
+from polar_bayes.physics.scene import SCENES, Scene
 from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
@@ -66,26 +66,6 @@ def test_a_scene_of_the_design_reads_as_written() -> None:
     np.testing.assert_allclose(stokes, alone, rtol=1e-12, atol=1e-30)
 
 
-def test_named_scenes_read_these_parameters() -> None:
-    material = ("roughness", "subsurface_fraction", "absorption", "refractive_index")
-    assert SCENES["paper"].parameters == material
-    assert SCENES["camera"].parameters == (
-        "roughness",
-        "subsurface_fraction",
-        "refractive_index",
-        "dolp_gain",
-    )
-    assert SCENES["goniometer"].parameters == (
-        "subsurface_fraction",
-        "refractive_index",
-        "angle_zero",
-        "channel_gain_ratio",
-        "leakage",
-        "discrepancy_amplitude",
-        "discrepancy_weights",
-    )
-
-
 @pytest.mark.thorough
 @each("name", SCENES)
 def test_leading_axes_of_parameters_and_geometry_broadcast(name: str) -> None:
@@ -101,17 +81,6 @@ def test_leading_axes_of_parameters_and_geometry_broadcast(name: str) -> None:
     for reading in ("dop", "q", "u", "intensity"):
         assert found[reading].shape == (2, 5, 3)
         np.testing.assert_allclose(found[reading][1, 2], one[reading], rtol=1e-12, atol=1e-15)
-
-
-@pytest.mark.thorough
-@each("name", SCENES)
-def test_turning_everything_around_the_normal_changes_nothing(name: str) -> None:
-    turned = VIEWS._replace(
-        view_azimuth=VIEWS.view_azimuth + 123.0, light_azimuth=VIEWS.light_azimuth + 123.0
-    )
-    here, there = (predict(SCENES[name], PARAMETERS, views) for views in (VIEWS, turned))
-    for reading in ("dop", "q", "u", "intensity"):
-        np.testing.assert_allclose(here[reading], there[reading], rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.thorough
@@ -186,59 +155,6 @@ def test_the_instrument_is_not_in_the_optics() -> None:
     np.testing.assert_array_equal(stokes_of(camera, optics_only, VIEWS), stokes)
 
 
-@pytest.mark.thorough
-def test_angle_zero_moves_the_geometry() -> None:
-    scene = Scene(SmoothSurface(), instrument=Instrument((AngleZero(),)))
-    shifted = scene.predict({**PARAMETERS, "angle_zero": 2.0}, VIEWS)
-    moved = VIEWS._replace(
-        view_zenith=VIEWS.view_zenith + 2.0, light_zenith=VIEWS.light_zenith + 2.0
-    )
-    np.testing.assert_allclose(
-        shifted["q"],
-        scene.stokes(PARAMETERS, moved)[:, 1] / (scene.stokes(PARAMETERS, moved)[:, 0]),
-        rtol=1e-12,
-    )
-
-
-@pytest.mark.thorough
-def test_figures_of_the_specification() -> None:
-    """Two digits and a half of the degree of polarization under a uniform sky, n 1.5, Beckmann."""
-    table = {
-        45.0: (0.831, 0.810, 0.654, 0.429),
-        55.0: (0.996, 0.961, 0.774, 0.553),
-        75.0: (0.577, 0.575, 0.643, 0.598),
-        85.0: (0.198, 0.290, 0.475, 0.518),
-    }
-    scene = Scene(RoughSurface(illumination=UniformSky()))
-    views = Geometry.from_degrees(
-        view_zenith=list(table), view_azimuth=180.0, light_zenith=0.0, light_azimuth=0.0
-    )
-    found = predict(
-        scene,
-        {"roughness": np.array([0.02, 0.1, 0.3, 0.5]), "refractive_index": 1.5},
-        views,
-    )["dop"]
-    np.testing.assert_allclose(found.T, list(table.values()), atol=1.2e-3)
-
-
-@each(
-    ("parts", "message"),
-    [
-        ({"surface": GGX()}, r"surface: GGX\(\) is no such part; give SmoothSurface\(\) or Ro"),
-        ({"subsurface": "lambertian"}, "subsurface: 'lambertian' is no such part; give Unpolar"),
-        ({"mixing": Lambertian()}, r"mixing: .* is no such part; give DopMixing\(\)"),
-        ({"instrument": DolpGain()}, r"instrument: .* give Instrument\(\(DolpGain\(\), ...\)\)"),
-        ({"coat": "clear"}, r"coat: 'clear' is no such part; give ClearCoat\(\), ThinFilm\(\)"),
-        ({"dispersion": "Cauchy"}, r"dispersion: .* give Cauchy\(\), Sellmeier\(\) or None"),
-        ({"mixing": DopMixing()}, "mixing: there is no subsurface to mix; give a subsurface"),
-        ({"subsurface": Depolarizer()}, "subsurface: nothing says how .* give mixing=Stokes"),
-    ],
-)
-def test_parts_that_do_not_fit_are_refused(parts: dict, message: str) -> None:
-    with pytest.raises(SceneError, match=message):
-        Scene(**{"surface": SmoothSurface(), **parts})
-
-
 def test_missing_parameters_are_named() -> None:
     with pytest.raises(SceneError, match="parameters: absorption, refractive_index missing; this"):
         SCENES["paper"].stokes({"roughness": 0.1, "subsurface_fraction": 0.2}, VIEWS)
@@ -265,28 +181,6 @@ EVERYTHING = Scene(
     Instrument((AngleZero(), BeamOverlap(), DolpGain())),
     Cauchy(),
 )
-
-
-def test_parameters_are_the_materials_in_their_order_then_the_light_then_the_instrument() -> None:
-    material = (
-        "roughness",
-        "subsurface_fraction",
-        "roughness_across",
-        "roughness_azimuth",
-        "albedo",
-        "cauchy_a",
-        "cauchy_b",
-        "coat_refractive_index",
-        "coat_absorbance",
-        "film_refractive_index",
-        "film_thickness",
-    )
-    instrument = ("angle_zero", "beam_overlap_zenith", "dolp_gain")
-    assert EVERYTHING.parameters == (*material, "light_degree", "light_angle", *instrument)
-    assert EVERYTHING.optical_parameters == EVERYTHING.parameters[:-3]
-    listed = [name for name in MATERIAL_PARAMETERS if name in material]
-    assert tuple(listed) == material
-    assert len(set(MATERIAL_PARAMETERS)) == len(MATERIAL_PARAMETERS)
 
 
 @pytest.mark.thorough

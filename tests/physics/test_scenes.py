@@ -42,14 +42,3 @@ def test_twenty_facets_are_as_good_as_four_hundred(name: str) -> None:
         few, many = (jax.jit(predict, static_argnums=0)(s, roughness) for s in (scene, fine))
         np.testing.assert_allclose(few["dop"], many["dop"], atol=0.0005)
         np.testing.assert_allclose(few["intensity"], many["intensity"], rtol=0.0015)
-
-
-def test_each_scene_reads_what_its_parts_read() -> None:
-    assert SCENES["paper"].parameters == (
-        "roughness",
-        "subsurface_fraction",
-        "absorption",
-        "refractive_index",
-    )
-    assert SCENES["goniometer"].parameters[:2] == ("subsurface_fraction", "refractive_index")
-    assert "roughness" not in SCENES["goniometer"].parameters

@@ -7,14 +7,12 @@ import pytest
 import vector_optics as twin
 from cases import each
 
-from polar_bayes.errors import SceneError
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
-from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
+from polar_bayes.physics.illumination import PointSource, UniformSky
 from polar_bayes.physics.microfacet import GGX, AnisotropicSlopes, Beckmann
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.second_bounce import TwoBounceSurface
-from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.surface import RoughSurface
 
 MANY = FacetQuadrature(10, 8)
@@ -44,13 +42,12 @@ def test_the_second_bounce_is_that_of_a_height_field(height_field_sky: np.ndarra
     the second and heights, which Smith's theory takes as independent of slopes.
     """
     rows = height_field_sky[height_field_sky[:, 3] == 0.0]
-    once, twice = [], []
-    for _, roughness, zenith, *_ in rows:
-        parameters = {"roughness": roughness, "refractive_index": 1.5}
-        sky = {"quadrature": MANY, "illumination": UniformSky()}
-        for kind, found in ((RoughSurface, once), (TwoBounceSurface, twice)):
-            found.append(Scene(kind(**sky)).stokes(parameters, seen_from(zenith))[0])
-    once, twice = np.array(once), np.array(twice)
+    parameters = {"roughness": rows[:, 1], "refractive_index": 1.5}
+    views = Geometry(*(jnp.asarray(x)[:, None] for x in (rows[:, 2], *np.zeros((3, len(rows))))))
+    once, twice = (
+        np.asarray(stokes_of(Scene(kind(Beckmann(), UniformSky(), MANY)), parameters, views))[:, 0]
+        for kind in (RoughSurface, TwoBounceSurface)
+    )
     assert np.abs(once[:, 0] / rows[:, 4] - 1.0).max() > 0.09
     np.testing.assert_allclose(twice[:, 0], rows[:, 4], rtol=0.045)
     degree = twice[:, 1] / twice[:, 0] - once[:, 1] / once[:, 0]
@@ -109,39 +106,35 @@ def test_point_source_agrees_with_vectors(azimuth: float) -> None:
     distribution = Beckmann()
     towards, source = twin.ray(*view), twin.ray(*light)
 
-    def open_share(ray: np.ndarray) -> float:
-        tangent = (1.0 - ray[2] ** 2) / ray[2] ** 2
-        return float(distribution.shadowing(jnp.asarray(tangent), jnp.asarray(roughness)))
+    def open_share(rays: np.ndarray) -> np.ndarray:
+        tangent = (1.0 - rays[..., 2] ** 2) / rays[..., 2] ** 2
+        return np.asarray(distribution.shadowing(jnp.asarray(tangent), jnp.asarray(roughness)))
 
     def angles(ray: np.ndarray) -> tuple[float, float]:
         zenith = np.rad2deg(np.arctan2(np.hypot(ray[0], ray[1]), ray[2]))
         return float(zenith), float(np.rad2deg(np.arctan2(ray[1], ray[0])))
 
     node, weight = np.polynomial.legendre.leggauss(48)
-    slope, weight = 3.5 * roughness * node, 3.5 * roughness * weight
+    x, y = (grid.ravel() for grid in np.meshgrid(3.5 * roughness * node, 3.5 * roughness * node))
+    share = np.outer(weight, weight).ravel() * (3.5 * roughness) ** 2
+    share = share * np.exp(-(x**2 + y**2) / roughness**2) / (np.pi * roughness**2)
+    facet = np.stack([x, y, np.ones_like(x)], -1) / np.sqrt(1.0 + x**2 + y**2)[:, None]
+    cosine = facet @ towards
+    ray = 2.0 * cosine[:, None] * facet - towards
+    half = (source - ray) / np.linalg.norm(source - ray, axis=-1, keepdims=True)
+    tilt = jnp.asarray((1.0 - half[:, 2] ** 2) / half[:, 2] ** 2)
+    lit = np.asarray(distribution.density(tilt, jnp.asarray(roughness))) / 4.0
+    lit = lit * open_share(source) * open_share(ray) / np.abs(ray[:, 2])
+    bright = share * (towards[2] + towards[0] * x) * lit
     total = np.zeros(3)
-    for x, weight_x in zip(slope, weight, strict=True):
-        for y, weight_y in zip(slope, weight, strict=True):
-            shown = towards[2] + towards[0] * x
-            if shown <= 0.0:
-                continue
-            facet = np.array([x, y, 1.0]) / np.sqrt(1.0 + x**2 + y**2)
-            cosine = towards @ facet
-            ray = 2.0 * cosine * facet - towards
-            half = source - ray
-            half /= np.linalg.norm(half)
-            if half[2] <= 0.0:
-                continue
-            share = np.exp(-(x**2 + y**2) / roughness**2) / (np.pi * roughness**2) * shown
-            tilt = jnp.asarray((1.0 - half[2] ** 2) / half[2] ** 2)
-            lit = float(distribution.density(tilt, jnp.asarray(roughness))) / 4.0
-            lit *= open_share(source) * open_share(ray) / abs(ray[2])
-            second = -(ray @ half)
-            arriving = twin.mirrored(twin.bare(n, 1.0 - second**2), angles(-ray), light)
-            # Seen as light that arrives, the first axis of the ray points the other way.
-            incident = arriving[1] / arriving[0], -arriving[2] / arriving[0]
-            found = twin.mirrored(twin.bare(n, 1.0 - cosine**2), view, angles(ray), incident)
-            total += weight_x * weight_y * share * lit * arriving[0] * found
+    for i in np.flatnonzero((towards[2] + towards[0] * x > 0.0) & (half[:, 2] > 0.0)):
+        second = twin.bare(n, 1.0 - (ray[i] @ half[i]) ** 2)
+        arriving = twin.mirrored(second, angles(-ray[i]), light)
+        # Seen as light that arrives, the first axis of the ray points the other way.
+        incident = arriving[1] / arriving[0], -arriving[2] / arriving[0]
+        first = twin.bare(n, 1.0 - cosine[i] ** 2)
+        found = twin.mirrored(first, view, angles(ray[i]), incident)
+        total += bright[i] * arriving[0] * found
     total *= open_share(towards) / towards[2]
     geometry = Geometry.from_degrees(
         view_zenith=[view[0]], view_azimuth=0.0, light_zenith=[light[0]], light_azimuth=azimuth
@@ -161,15 +154,3 @@ def test_equal_slopes_of_grooves_are_isotropic() -> None:
     grooves = second_bounce(parameters, geometry, slopes=AnisotropicSlopes(35.0), **facets)
     alike = second_bounce(parameters, geometry, **facets)
     np.testing.assert_allclose(grooves, alike, rtol=0.05, atol=1e-4)
-
-
-def test_a_surface_of_one_bounce_is_simpler() -> None:
-    surface = TwoBounceSurface(GGX(), quadrature=MANY)
-    assert surface.simpler() == (RoughSurface(GGX(), quadrature=MANY),)
-    assert Scene(surface).parameters == Scene(RoughSurface(GGX())).parameters
-
-
-@each("light", [Disc(5.0), PointSource(LinearPolarization())])
-def test_other_light_is_refused(light) -> None:
-    with pytest.raises(SceneError, match="has no second bounce; give PointSource"):
-        TwoBounceSurface(illumination=light)

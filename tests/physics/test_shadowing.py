@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import each
-from hypothesis import given, settings
+from hypothesis import settings
 from hypothesis import strategies as st
 
 from polar_bayes.physics.geometry import Geometry
@@ -22,40 +22,6 @@ from polar_bayes.physics.surface import RoughSurface
 RUN = settings(deadline=None, max_examples=80, derandomize=True)
 share = st.floats(1e-6, 1.0)
 RULES = (SeparableShadowing(), HeightCorrelatedShadowing(), NoShadowing())
-
-
-@given(view=share, light=share)
-@RUN
-def test_a_share_is_a_share_and_symmetric(view: float, light: float) -> None:
-    for rule in RULES:
-        seen = rule.both(jnp.asarray(view), jnp.asarray(light))
-        assert 0.0 < seen <= 1.0
-        back = rule.both(jnp.asarray(light), jnp.asarray(view))
-        np.testing.assert_allclose(seen, back, rtol=1e-15)
-
-
-@given(view=share, light=share)
-@RUN
-def test_correlated_heights_hide_less_but_never_less_than_one_direction(
-    view: float, light: float
-) -> None:
-    separable, correlated, nothing = (
-        rule.both(jnp.asarray(view), jnp.asarray(light)) for rule in RULES
-    )
-    assert separable <= correlated * (1.0 + 1e-15)
-    assert correlated <= min(view, light) * (1.0 + 1e-15)
-    assert nothing == 1.0
-    # 1 + Lambda of both directions.
-    expected = 1.0 / (1.0 / view + 1.0 / light - 1.0)
-    np.testing.assert_allclose(correlated, expected, rtol=1e-12)
-
-
-@pytest.mark.thorough
-@given(view=share)
-@RUN
-def test_where_one_direction_sees_all_the_rules_agree(view: float) -> None:
-    for rule in RULES[:2]:
-        np.testing.assert_allclose(rule.both(jnp.asarray(view), 1.0), view, rtol=1e-15)
 
 
 @pytest.mark.thorough
@@ -79,11 +45,6 @@ def test_the_rules_order_the_brightness_of_a_surface_and_leave_its_polarization(
     assert separable[2] < 0.9 * correlated[2] < 0.9 * nothing[2]
     for one in light[1:]:
         np.testing.assert_allclose(one.q, light[0].q, rtol=1e-14)
-
-
-def test_only_the_correlated_rule_has_something_simpler() -> None:
-    assert HeightCorrelatedShadowing().simpler() == (SeparableShadowing(),)
-    assert SeparableShadowing().simpler() == ()
 
 
 def test_a_rule_of_your_own_serves_every_source() -> None:

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import vector_optics as twin
 from cases import each
-from hypothesis import given, settings
+from hypothesis import settings
 from hypothesis import strategies as st
 
-from polar_bayes.errors import SceneError
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
@@ -86,14 +85,6 @@ def test_equal_roughnesses_are_isotropic(source: object, name: str) -> None:
     np.testing.assert_allclose(both[:, 1:] / one[:, :1], one[:, 1:] / one[:, :1], atol=3e-3)
 
 
-@pytest.mark.thorough
-@SOURCES
-def test_turning_sample_viewer_and_light_together_changes_nothing(source: object) -> None:
-    still = stokes_of(scene(source, ALONG), material(0.4, 0.15, 25.0), seen())
-    turned = stokes_of(scene(source, ALONG), material(0.4, 0.15, 25.0 + 77.0), seen(77.0))
-    np.testing.assert_allclose(turned, still, rtol=1e-11, atol=1e-14)
-
-
 @SOURCES
 def test_a_right_angle_turns_one_roughness_into_the_other(source: object) -> None:
     one = stokes_of(scene(source, ALONG), material(0.4, 0.15, 25.0), seen())
@@ -107,34 +98,6 @@ def test_a_mirror_image_has_the_other_sign_of_u(source: object) -> None:
     there = stokes_of(scene(source, ALONG), material(0.4, 0.15, -25.0), seen(sign=-1.0))
     np.testing.assert_allclose(there, here * np.array([1.0, 1.0, -1.0]), rtol=1e-11, atol=1e-14)
     assert np.max(np.abs(here[:, 2] / here[:, 0])) > 0.01
-
-
-@pytest.mark.thorough
-@SOURCES
-def test_along_an_axis_of_symmetry_there_is_no_u(source: object) -> None:
-    """The viewer, the light and the grooves in one plane."""
-    plane = seen()._replace(view_azimuth=jnp.full(4, 40.0), light_azimuth=jnp.full(4, 220.0))
-    for turn in (40.0, 130.0):
-        found = stokes_of(scene(source, ALONG), material(0.4, 0.15, turn), plane)
-        np.testing.assert_allclose(found[:, 2], 0.0, atol=1e-10)
-
-
-@given(
-    view=zenith, light=zenith, one=azimuth, other=azimuth, turn=azimuth, r=roughness, s=roughness
-)
-@RUN
-def test_viewer_and_light_may_change_places(
-    view: float, light: float, one: float, other: float, turn: float, r: float, s: float
-) -> None:
-    """The brightness of a point source over both cosines; the body has no such law when rough."""
-    there = Geometry(*(jnp.array([x]) for x in (view, one, light, other)))
-    mirror = Scene(POINT.surface)
-    forth, back = (
-        stokes_of(mirror, material(r, s, turn), geometry)[0]
-        for geometry in (there, there.reversed())
-    )
-    cosines = np.cos(np.deg2rad(light)) / np.cos(np.deg2rad(view))
-    np.testing.assert_allclose(forth[0], back[0] * cosines, rtol=1e-9)
 
 
 # Roughness along, across, its azimuth, and the view zenith; the last three are ten times as steep.
@@ -218,14 +181,3 @@ def test_facets_of_a_smooth_surface_sum_to_one(name: str, slopes: object) -> Non
     cosine, square = jnp.cos(jnp.deg2rad(views)), jnp.sin(jnp.deg2rad(views)) ** 2
     bound = 2e-5 if name == "GGX" else 2e-4
     np.testing.assert_allclose(light.intensity, stack.reflection(cosine, square).mean, rtol=bound)
-
-
-def test_the_azimuth_is_a_number_or_a_parameter() -> None:
-    assert AnisotropicSlopes(30.0).parameters == ("roughness", "roughness_across")
-    assert ALONG.parameters == ("roughness", "roughness_across", "roughness_azimuth")
-    assert ALONG.simpler() == (IsotropicSlopes(),)
-    fixed = stokes_of(scene(PointSource(), AnisotropicSlopes(30.0)), material(0.4, 0.1), seen())
-    fitted = stokes_of(POINT, material(0.4, 0.1, 30.0), seen())
-    np.testing.assert_allclose(fixed, fitted, rtol=1e-12)
-    with pytest.raises(SceneError, match=r"AnisotropicSlopes: azimuth: 400.0 is neither a number"):
-        AnisotropicSlopes(400.0)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from polar_bayes.physics.boundary import Diattenuation
-from polar_bayes.physics.geometry import cos_degrees, per_ray, sin_degrees
+from polar_bayes.physics.geometry import cos_degrees, sin_degrees
 from polar_bayes.physics.stack import Layer, Stack
 
 RUN = settings(deadline=None, max_examples=60, derandomize=True)
@@ -117,35 +117,6 @@ def test_a_coat_without_effect_is_not_there(
     )
 
 
-@pytest.mark.thorough
-def test_splitting_a_coat_in_two_changes_nothing() -> None:
-    c, b = at(jnp.array([0.0, 40.0, 80.0]))
-    whole, halves = thick([1.0, 1.4, 1.7], [0.4]), thick([1.0, 1.4, 1.4, 1.7], [0.1, 0.3])
-    for law in (reflect, transmit):
-        np.testing.assert_allclose(
-            one_by_one(law(halves, c, b)), one_by_one(law(whole, c, b)), rtol=1e-13
-        )
-
-
-@pytest.mark.thorough
-def test_a_film_on_a_coat_adds_fields_then_powers() -> None:
-    """The coat's upper boundary is the film; what comes back through it is added as power."""
-    film, coat, body, absorbance = (1.38, 2.0), 1.5, 1.8, 0.2
-    c, b = at(50.0)
-    layers = (
-        Layer(jnp.asarray(film[0]), wavenumber=jnp.asarray(2.0 * film[1])),
-        Layer(jnp.asarray(coat), jnp.asarray(absorbance)),
-    )
-    stack = Stack(jnp.asarray(body), layers)
-    above, _, through = twin.films(1.0, (film,), coat, float(b))
-    below, _, _ = twin.films(coat, (film,), 1.0, float(b))
-    base = np.abs(twin.films(coat, (), body, float(b))[0]) ** 2
-    kept = np.exp(-2.0 * absorbance / twin.cosine(coat, float(b)).real)
-    expected = np.abs(above) ** 2
-    expected += through**2 * base * kept / (1.0 - np.abs(below) ** 2 * base * kept)
-    np.testing.assert_allclose(one_by_one(reflect(stack, c, b))[:2], expected, rtol=1e-12)
-
-
 # --- light that comes from the body ---------------------------------------------------------------
 
 
@@ -217,11 +188,6 @@ def test_escape_through_two_coats_agrees_with_brute_force(indexes: list, bound: 
     np.testing.assert_allclose(escape(thick(indexes, [0.2, 0.3])), truth, rtol=bound)
 
 
-def test_a_black_coat_returns_only_what_never_enters_it() -> None:
-    """Of the body's index: nothing at all."""
-    np.testing.assert_allclose(escape(thick([1.0, 1.5, 1.5], [50.0])), 1.0, rtol=1e-14)
-
-
 @given(body=index, coat=index)
 @RUN
 def test_as_much_diffuse_light_enters_as_leaves(body: float, coat: float) -> None:
@@ -230,22 +196,6 @@ def test_as_much_diffuse_light_enters_as_leaves(body: float, coat: float) -> Non
         stack = thick([1.0, coat, body], [absorbance])
         entering = stack.hemispherical_transmission()
         np.testing.assert_allclose(body**2 * escape(stack), entering, rtol=1e-8)
-
-
-def test_absorption_in_a_coat_never_brings_light_back() -> None:
-    absorbances = [0.0, 1e-3, 0.1, 1.0, 10.0]
-    shares = [float(escape(thick([1.0, 1.4, 1.6], [a]))) for a in absorbances]
-    assert np.all(np.diff(shares) > 0.0)
-    assert shares[-1] <= 1.0
-
-
-@pytest.mark.thorough
-def test_shapes_broadcast_over_facets() -> None:
-    layers = (Layer(jnp.array([1.3, 1.4]), jnp.asarray(0.1)),)
-    stack = per_ray(Stack(jnp.array([1.5, 1.6]), layers))
-    cosine = jnp.full((2, 5), 0.5)
-    assert stack.reflection(cosine, 1.0 - cosine**2).mean.shape == (2, 5)
-    assert stack.transmission(cosine, 1.0 - cosine**2).contrast.shape == (2, 5)
 
 
 @each(("thickness", "bound"), [(230.0, 1e-12), (3000.0, 1e-9), (1e4, 2e-4)])

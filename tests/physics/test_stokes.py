@@ -30,13 +30,9 @@ def test_unpolarized_light_has_finite_derivatives(dtype: type) -> None:
         return degree_of_linear_polarization(x[0], x[1])
 
     assert length(zero) == pytest.approx(TIP, rel=1e-6)
-    np.testing.assert_array_equal(jax.grad(length)(zero), 0.0)
-    np.testing.assert_allclose(jax.hessian(length)(zero), np.eye(2) / TIP, rtol=1e-5)
-
-
-@pytest.mark.thorough
-def test_above_the_tip_the_length_is_exact() -> None:
-    np.testing.assert_allclose(degree_of_linear_polarization(3e-7, 4e-7), 5e-7, rtol=1e-10)
+    np.testing.assert_array_equal(jax.jit(jax.grad(length))(zero), 0.0)
+    np.testing.assert_allclose(jax.jit(jax.hessian(length))(zero), np.eye(2) / TIP, rtol=1e-5)
+    np.testing.assert_allclose(length(jnp.array([3e-7, 4e-7], dtype)), 5e-7, rtol=1e-6)
 
 
 @each(

@@ -12,7 +12,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from polar_bayes.errors import SceneError
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import PointSource, UniformSky
@@ -26,11 +25,10 @@ from polar_bayes.physics.instrument import (
 )
 from polar_bayes.physics.microfacet import GGX, AnisotropicSlopes, Beckmann
 from polar_bayes.physics.mixing import StokesMixing
-from polar_bayes.physics.scene import MATERIAL_PARAMETERS, SCENES, Scene
+from polar_bayes.physics.scene import SCENES, Scene
 from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.subsurface import Lambertian, TurbidMedium
 from polar_bayes.physics.surface import RoughSurface, SmoothExit, SmoothSurface
-from polar_bayes.physics.variants import effects_of
 
 RUN = settings(deadline=None, max_examples=60, derandomize=True)
 direction = st.tuples(st.floats(0.0, 75.0), st.floats(-360.0, 360.0))
@@ -147,17 +145,6 @@ def test_a_leaning_normal_is_light_and_viewer_rotated_the_other_way(
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * expected[0])
 
 
-def test_the_lean_is_the_one_that_its_names_say() -> None:
-    """A normal that leans towards azimuth 0 brings a viewer there nearer to itself."""
-    zenith, azimuth = jnp.array([30.0, 30.0]), jnp.array([0.0, 90.0])
-    towards_x = tilted_direction(zenith, azimuth, *(jnp.tan(jnp.deg2rad(x)) for x in (10.0, 0.0)))
-    towards_y = tilted_direction(zenith, azimuth, *(jnp.tan(jnp.deg2rad(x)) for x in (0.0, 10.0)))
-    np.testing.assert_allclose(towards_x.zenith[0], 20.0, rtol=1e-14)
-    np.testing.assert_allclose(towards_y.zenith[1], 20.0, rtol=1e-14)
-    assert towards_x.zenith[1] > 30.0
-    assert towards_y.zenith[0] > 30.0
-
-
 @given(view=direction, light=direction, tilts=tilt)
 @RUN
 def test_a_mirror_facet_does_not_care_where_the_normal_is(
@@ -206,25 +193,6 @@ def test_brightness_and_way_out_are_those_of_a_leaning_population(tilts: tuple) 
 # --- no lean ------------------------------------------------------------------------------------
 
 
-@pytest.mark.thorough
-@each("name", ["grooves, polarized beam, body", "sky", "goniometer"])
-def test_without_a_lean_nothing_changes(name: str) -> None:
-    scene = (LEVEL | SCENES)[name]
-    zenith = np.array([0.0, 1e-8, 1e-3, 30.0, 45.0, 80.0, 89.9, 89.9999999, 45.0])
-    light = np.array([0.0, 30.0, 2e-3, 30.0, 60.0, 45.0, 89.9, 89.9999999, 45.0])
-    azimuth = np.array([180.0, 20.0, 200.0, 90.0, 300.0, 180.0, 180.0, 180.0, 10.0])
-    around = np.array([0.0, 80.0, 30.0, 0.0, 45.0, 0.0, 0.0, 10.0, 10.0])
-    views = Geometry(*(jnp.asarray(x) for x in (zenith, azimuth, light, around)))
-    values = tilted((0.0, 0.0)) | {name: 0.1 for name in scene.parameters if name not in PARAMETERS}
-    values |= {"discrepancy_weights": np.zeros(3), "channel_gain_ratio": 1.1}
-    level = predict(scene, values, views)
-    found = predict(leaning(scene), values, views)
-    for reading in level:
-        np.testing.assert_allclose(found[reading], level[reading], rtol=3e-9, atol=1e-13)
-        # A hair before 90 degrees the last bit of a zenith is 1e-7 of its cosine.
-        np.testing.assert_allclose(found[reading][:7], level[reading][:7], rtol=2e-12, atol=1e-13)
-
-
 def test_no_lean_is_no_lean_to_the_last_bit() -> None:
     zenith = jnp.array([0.0, 1e-12, 1e-3, 45.0, 89.999, 89.9999999])
     found = tilted_direction(zenith, jnp.full(6, 70.0), *jnp.zeros((2, 1)))
@@ -246,14 +214,6 @@ def test_without_the_part_nothing_of_it_is_in_the_program() -> None:
 
 
 # --- where directions stop having a meaning -----------------------------------------------------
-
-
-@pytest.mark.thorough
-def test_below_the_horizon_counts_as_grazing() -> None:
-    slopes = (jnp.tan(jnp.deg2rad(-20.0)), jnp.zeros(()))
-    zenith = jnp.array([60.0, 69.99, 70.5, 80.0, 89.9, 89.9995])
-    found = np.asarray(tilted_direction(zenith, jnp.zeros(6), *slopes).zenith)
-    np.testing.assert_allclose(found, [80.0, 89.99, 89.999, 89.999, 89.999, 89.9995], rtol=1e-12)
 
 
 @pytest.mark.thorough
@@ -331,21 +291,6 @@ def test_the_instrument_acts_on_the_stated_angles() -> None:
 
 
 @pytest.mark.thorough
-def test_the_tilts_are_of_the_material() -> None:
-    scene = leaning(SCENES["camera"])
-    assert {"normal_tilt_x", "normal_tilt_y"} <= set(MATERIAL_PARAMETERS)
-    assert scene.parameters == (
-        "roughness",
-        "subsurface_fraction",
-        "refractive_index",
-        "normal_tilt_x",
-        "normal_tilt_y",
-        "dolp_gain",
-    )
-    assert {"normal_tilt_x", "normal_tilt_y"} <= set(scene.optical_parameters)
-
-
-@pytest.mark.thorough
 def test_every_patch_leans_by_itself() -> None:
     scene = leaning(SCENES["camera"])
     views = Geometry.from_degrees(
@@ -369,29 +314,6 @@ def test_a_known_lean_is_no_parameter() -> None:
         predict(scene, tilted((4.0, -2.0)), views) for scene in (known, leaning(SCENES["camera"]))
     )
     np.testing.assert_allclose(found["q"], expected["q"], rtol=1e-14)
-
-
-@pytest.mark.thorough
-def test_the_ledger_of_effects_finds_it() -> None:
-    found = {effect.name: effect for effect in effects_of(leaning(SCENES["camera"]))}
-    assert found["TiltedNormal"].path == "normal"
-    assert found["TiltedNormal"].apply(leaning(SCENES["camera"])) == SCENES["camera"]
-
-
-@each(
-    ("make", "message"),
-    [
-        (lambda: TiltedNormal(tilt_x=61.0), "TiltedNormal: tilt_x: 61.0 is neither a number from"),
-        (lambda: TiltedNormal(tilt_y="two degrees"), "TiltedNormal: tilt_y: 'two degrees' is nei"),
-        (
-            lambda: Scene(SmoothSurface(), normal=5.0),
-            r"normal: 5.0 is no such part; give TiltedNormal\(\) or None",
-        ),
-    ],
-)
-def test_settings_that_make_no_sense_are_refused(make: object, message: str) -> None:
-    with pytest.raises(SceneError, match=message):
-        make()
 
 
 # --- what a lean does to the material -----------------------------------------------------------

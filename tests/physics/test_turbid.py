@@ -3,18 +3,16 @@
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from physics.test_half_space import read
 
-from polar_bayes.errors import SceneError
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
 from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.stokes import LinearPolarization
-from polar_bayes.physics.subsurface import Depolarizer, TurbidMedium
+from polar_bayes.physics.subsurface import TurbidMedium
 from polar_bayes.physics.surface import AbstractSurface, RoughSurface, SmoothSurface
 
 BODY = {"subsurface_fraction": 1.0, "absorption": 0.3, "refractive_index": 1.5, "roughness": 0.2}
@@ -145,33 +143,3 @@ def test_without_internal_reflection_the_body_is_darker() -> None:
     with_it = stokes_of(body(), BODY, VIEWS)[:, 0]
     without = stokes_of(body(internal_reflection=None), BODY, VIEWS)[:, 0]
     assert np.all(with_it > 1.05 * without)
-
-
-@pytest.mark.thorough
-def test_colors_broadcast() -> None:
-    colors = {
-        **BODY,
-        "absorption": jnp.array([0.1, 1.0]),
-        "refractive_index": jnp.array([1.5, 1.49]),
-    }
-    both = stokes_of(body(), colors, VIEWS)
-    each = [
-        stokes_of(body(), {**BODY, "absorption": a, "refractive_index": n}, VIEWS)
-        for a, n in ((0.1, 1.5), (1.0, 1.49))
-    ]
-    np.testing.assert_allclose(both, jnp.stack(each), rtol=1e-12, atol=1e-15)
-
-
-def test_its_simpler_form_is_a_depolarizer() -> None:
-    assert TurbidMedium().simpler() == (Depolarizer(),)
-    assert body(polarized_fraction="polarized_fraction").parameters == (
-        "subsurface_fraction",
-        "absorption",
-        "refractive_index",
-        "polarized_fraction",
-    )
-
-
-def test_the_fraction_is_checked() -> None:
-    with pytest.raises(SceneError, match=r"TurbidMedium: polarized_fraction: 1.5 is neither"):
-        TurbidMedium(1.5)

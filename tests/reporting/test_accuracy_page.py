@@ -4,45 +4,12 @@ import numpy as np
 import pytest
 from clipping import clipped
 from matplotlib.text import Text
-from pages import Page
 from synthetic_accuracy import ROWS, make_accuracy
-from synthetic_results import make_result
 
 import polar_bayes as pb
 from polar_bayes.reporting.report import render
-from polar_bayes.reporting.text import reference_sentence
 
-
-@pytest.fixture(scope="module")
-def page() -> Page:
-    return Page(render(make_accuracy()))
-
-
-def test_it_stands_alone_and_its_anchors_lead_somewhere(page):
-    assert page.open == []
-    assert not {"script", "link", "iframe", "object", "embed", "base"} & set(page.tags)
-    ids = page.values("id")
-    assert len(ids) == len(set(ids))
-    assert set(page.values("aria-labelledby")) <= set(ids)
-    assert "<leaf>" in page.text
-
-
-def test_the_advice_comes_first_and_the_reference_with_it(page):
-    assert page.text.index("use nuts for it") < page.text.index("Error against time")
-    assert "10,000 draws of NUTS with an effective sample size of 5,000" in page.text
-    assert "is at most 0.012 posterior sd." in page.text
-
-
-@pytest.mark.thorough
-def test_an_error_that_the_reference_cannot_tell_is_marked(page):
-    row = page.text[page.text.index("nuts long") :]
-    assert "< 0.024" in row
-
-
-def test_a_doubtful_reference_is_said_in_red():
-    study = make_accuracy(doubts="its R-hat is 1.3")
-    assert "verdict failed" in render(study)
-    assert reference_sentence(study).endswith("Against it speaks: its R-hat is 1.3.")
+pytestmark = pytest.mark.usefixtures("unpainted")
 
 
 @pytest.mark.thorough
@@ -52,14 +19,6 @@ def test_the_report_lies_beside_its_file(tmp_path):
     assert page.read_text() == render(again)
     with pytest.raises(pb.FitError, match="it goes with calibrations only"):
         pb.report(make_accuracy(), tmp_path / "other", comparisons={})
-
-
-def test_a_fit_that_holds_a_study_shows_it():
-    result = make_result()
-    result["accuracy"] = make_accuracy()["accuracy"]
-    text = Page(render(result)).text
-    assert "Accuracy against time" in text
-    assert "use nuts for it" in text
 
 
 @pytest.mark.thorough

@@ -8,7 +8,6 @@ import pytest
 import xarray as xr
 from cases import each
 from clipping import clipped
-from pages import EVIL, Page
 from synthetic_calibrations import NAMES, make_calibration
 from synthetic_results import make_result
 
@@ -16,6 +15,8 @@ import polar_bayes as pb
 from polar_bayes.calibration import verdict
 from polar_bayes.reporting.plots_calibration import parameter_ranks
 from polar_bayes.reporting.report import render
+
+pytestmark = pytest.mark.usefixtures("unpainted")
 
 FAILED = (3, 50, 77)
 
@@ -30,157 +31,6 @@ def broken() -> xr.DataTree:
     """Roughness is told too narrowly, and the index too high."""
     wrong = {"narrow": {"roughness": 0.7}, "shifted": {"refractive_index": 0.4}}
     return make_calibration(**wrong, failed=FAILED, method="laplace")
-
-
-@pytest.fixture(scope="module")
-def page(good: xr.DataTree, broken: xr.DataTree) -> Page:
-    return Page(render(good, comparisons={"laplace": broken}))
-
-
-def test_it_stands_alone_and_its_anchors_lead_somewhere(page: Page) -> None:
-    assert page.open == []
-    assert not {"script", "link", "iframe", "object", "embed", "base"} & set(page.tags)
-    assert all(value.startswith("data:image/svg+xml;base64,") for value in page.values("src"))
-    ids = page.values("id")
-    assert len(ids) == len(set(ids))
-    assert {value[1:] for value in page.values("href") if value.startswith("#")} <= set(ids)
-    assert set(page.values("aria-labelledby")) <= set(ids)
-
-
-def test_the_verdict_comes_first(page: Page, broken: xr.DataTree) -> None:
-    assert page.text.index("Calibrated.") < page.text.index("Parameters were drawn")
-    assert (
-        "The ranks, coverage and spread of 3 parameters in 400 simulations pass a joint"
-        in page.text
-    )
-    text = Page(render(broken)).text
-    assert "Not calibrated." in text
-    assert "roughness: intervals are too narrow (p = " in text
-    assert "refractive_index: the posterior is too high (p = " in text
-    table = pb.summary(broken)
-    for label in ("roughness", "refractive_index"):
-        said = f"the true {label.replace('_', ' ')} in {table.loc[label, 'held_95']:.1%}"
-        assert said in text
-    assert "0.0001 (fails)" in text
-
-
-def test_every_number_of_the_table_is_the_tree_s(page: Page, good: xr.DataTree) -> None:
-    for _, row in pb.summary(good).iterrows():
-        held = f"{row['held_80']:.1%} ({100 * row['held_80_low']:.1f}"
-        assert held in page.text
-        assert f"{row['crps']:.3g}" in page.text
-
-
-@pytest.mark.thorough
-def test_readings_have_a_section_of_their_own(good: xr.DataTree) -> None:
-    assert "Status of the fits" in Page(render(good)).text
-    assert 'id="readings"' not in render(good)
-    tree = make_calibration(failed=FAILED, readings={"dop": 0.7})
-    page = Page(render(tree))
-    assert page.open == []
-    assert "Parameters are calibrated, predicted readings are not." in page.text
-    assert "fail a joint test of their own that a right model fails 5% of the time" in page.text
-    assert "degree of polarization, left out" in page.text
-    assert "predictions are too narrow" in page.text
-    assert "0.0001 (fails)" in page.text
-    assert "3 of 400" in page.text
-    assert any("Distribution of the ranks of readings" in x for x in page.values("alt"))
-
-
-@pytest.mark.thorough
-def test_failed_fits_are_counted_everywhere(page: Page) -> None:
-    for said in (
-        "3 of 400 fits: not converged.",
-        "3 of 400 fits have no answer.",
-        "all tests pass 3 of 400",
-        "not converged no answer was reached; NaN 3 0.8% 0",
-        "none no numbers 3 0.8% 0",
-        "Pareto k above 0.7 39 of 397 fits that know it (9.8%)",
-        "effective draws: median 302",
-    ):
-        assert said in page.text
-    text = Page(render(make_calibration(failed=tuple(range(60))))).text
-    assert "Calibrated, but 15% of the fits failed." in text
-    assert 'class="verdict failed"' in render(make_calibration(failed=tuple(range(60))))
-
-
-def test_every_figure_says_how_to_read_it(page: Page) -> None:
-    assert page.tags.count("img") == page.tags.count("figcaption") == 4
-    assert all(page.values("alt"))
-    for said in (
-        "in at most one of twenty right calibrations",
-        "intervals are too narrow",
-        "in at least 19 of 20 calibrations",
-        "Dots belong on the dashed lines at 50, 80 and 95%",
-        "estimates shrink towards the prior",
-        "Band and dots are those of importance; the others are drawn over it.",
-    ):
-        assert said in page.text
-
-
-@pytest.mark.thorough
-def test_the_comparison_says_which_parameter_and_how(page: Page) -> None:
-    assert "Of 3 parameters none fails by importance, 2 fail by laplace." in page.text
-    assert "by laplace intervals are too narrow (p = 0.0001); " in page.text
-    assert "score against importance" in page.text
-    assert "subsurface_fraction: " not in page.text
-
-
-@pytest.mark.thorough
-def test_many_parameters_stay_readable() -> None:
-    names = tuple(f"parameter_{at}" for at in range(15))
-    page = Page(render(make_calibration(names=names, count=60)))
-    assert page.tags.count("img") == 8
-    alternatives = page.values("alt")
-    assert all(any(f"{name}" in said for said in alternatives) for name in names)
-    assert page.text.count("The same of parameter_12, parameter_13 and parameter_14.") == 4
-
-
-@pytest.mark.thorough
-def test_wavelengths_are_parameters_of_their_own() -> None:
-    colors = (450.0, 650.0)
-    page = Page(render(make_calibration(names=NAMES[:1], wavelengths=colors, count=60)))
-    assert "roughness[450] roughness, 450 nm" in page.text
-    assert "2 parameters in 60 simulations" in page.text
-
-
-@pytest.mark.thorough
-def test_a_check_that_is_broken_on_purpose_says_so() -> None:
-    page = Page(render(make_calibration(count=60, truth={"priors": "Uniform(0, 1)"})))
-    assert "differs on purpose from what was fitted, in its priors" in page.text
-
-
-@pytest.fixture(scope="module")
-def evil_page() -> str:
-    names = ("a" * 60, "x")
-    own = {"capture": EVIL, "scene": EVIL, "priors": {EVIL: EVIL * 20}, "versions": {"a": EVIL}}
-    asked = {"names": names, "count": 40, "failed": (1,)}
-    return render(
-        make_calibration(**asked, **own, method=EVIL),
-        comparisons={EVIL + "2": make_calibration(**asked)},
-    )
-
-
-def test_names_are_text_and_nothing_else(evil_page: str) -> None:
-    page = Page(evil_page)
-    assert "script" not in page.tags
-    assert not [name for _, name, _ in page.attributes if name.startswith("on")]
-    assert f"Calibration report: {EVIL}" in page.text
-    assert "default-src 'none'" in evil_page
-
-
-@pytest.mark.thorough
-def test_every_table_scrolls_in_a_box_of_its_own(evil_page: str) -> None:
-    tables = re.findall(r"<div class=\"scroll[^>]*>\s*<table id", evil_page)
-    assert len(tables) == evil_page.count("<table") == 4
-
-
-@pytest.mark.thorough
-def test_a_calibration_without_an_answer_has_a_page() -> None:
-    text = Page(render(make_calibration(count=30, failed=tuple(range(30))))).text
-    assert "Not calibrated" in text
-    assert "100% of the fits failed" in text
-    assert not re.search(r"\bnan\b", text)
 
 
 def test_the_folder_holds_page_and_calibration(tmp_path: Path, broken: xr.DataTree) -> None:

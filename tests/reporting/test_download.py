@@ -16,6 +16,8 @@ from synthetic_results import make_result, pool
 import polar_bayes as pb
 from polar_bayes.reporting.page import csv_link
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
 
 

@@ -1,11 +1,15 @@
 """A result at a glance: the report's words, and the tree stays what it is."""
 
+import numpy as np
 import pytest
 from pages import EVIL, Page
+from plates import plate_capture
 from synthetic_results import make_result, replace
 
 import polar_bayes as pb
 from polar_bayes.errors import FitError
+
+pytestmark = pytest.mark.usefixtures("unpainted")
 
 SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
 
@@ -40,9 +44,9 @@ def test_a_long_table_is_cut_and_says_so() -> None:
 
 
 def test_a_capture_tells_its_variables_and_what_is_unlikely() -> None:
-    capture = pb.simulate("glass", protocol=pb.simulation.Protocol(views=5, wavelengths=()))
+    capture = plate_capture(np.linspace(20.0, 70.0, 5), 0.02, seed=1)
     text = repr(pb.show(capture.drop_attrs(deep=False)))
-    assert text.startswith("capture: capture\nReadings: dop")
+    assert text.startswith("capture: capture\nReadings: q")
     assert "Set-up: not stated" in text
     assert "view_zenith" in text.partition("variable")[2]
     with pytest.raises(pb.CaptureError, match="no such variable"):

@@ -14,6 +14,8 @@ from polar_bayes.reporting import plots_curves as module
 from polar_bayes.reporting.plots_curves import LEVELS, plot_spectrum, spectra
 from polar_bayes.reporting.report import render
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 SMALL = {"views": 6, "draws": 60, "variables": ("dop",)}
 
 
@@ -133,10 +135,3 @@ def test_draws_that_are_not_finite_are_not_drawn() -> None:
     draws = result["posterior"]["absorption"].to_numpy().copy()
     draws[0, 0, 1] = np.nan
     assert set(spectra(replace(result, "posterior", "absorption", draws))) == {"refractive_index"}
-
-
-def test_the_page_says_what_ties_the_colors() -> None:
-    text = render(with_law())
-    assert 'id="spectrum"' in text
-    assert "between and beyond the measured" in text
-    assert "Nothing in this fit ties the colors together" in text

@@ -45,29 +45,20 @@ def pooled():
     return pool(make_result(**SMALL, materials=("leaf", "fruit", "stone")), "roughness")
 
 
-every_plot = each("draw", DRAWN.values(), ids=DRAWN)
-
-
 def test_every_public_plot_is_tested_here() -> None:
     assert set(DRAWN) == {name for name in pb.plots.__all__ if name.startswith("plot_")}
 
 
-@every_plot
-def test_a_notebook_shows_it_and_pyplot_does_not_know_it(draw) -> None:
-    before = dict(rcParams)
-    figure = draw()
-    assert isinstance(figure, Figure)
-    assert figure.axes
-    assert figure._repr_png_().startswith(b"\x89PNG")
-    assert not hasattr(figure, "number")  # which pyplot gives to its own
-    assert dict(rcParams) == before
-
-
-@every_plot
-def test_it_takes_the_style_that_is_chosen(draw) -> None:
+@each("draw", DRAWN.values(), ids=DRAWN)
+def test_a_plot_takes_the_chosen_style_and_pyplot_does_not_know_it(draw) -> None:
     with matplotlib.style.context("dark_background"):
+        before = dict(rcParams)
         figure = draw()
-        figure.draw_without_rendering()
+        assert isinstance(figure, Figure)
+        assert figure.axes
+        assert figure._repr_png_().startswith(b"\x89PNG")  # as a notebook shows it
+        assert dict(rcParams) == before
+    assert not hasattr(figure, "number")  # which pyplot gives to its own
     assert to_hex(figure.get_facecolor()) == "#000000"
     labels = [text for a in figure.axes for text in (a.xaxis.label, a.yaxis.label, a.title)]
     assert {to_hex(text.get_color()) for text in labels if text.get_text()} <= {"#ffffff"}

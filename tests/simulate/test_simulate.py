@@ -1,6 +1,7 @@
 """Captures of known truth: what they hold, that the seed decides, and whose noise it is."""
 
 import functools
+import re
 
 import jax
 import numpy as np
@@ -66,14 +67,6 @@ def test_the_default_capture_follows_the_papers_protocol():
     assert float(capture["view_zenith"].max()) == 85.0
     assert len(np.unique(capture["view_azimuth"])) == 4
     np.testing.assert_array_equal(capture["wavelength"], [450.0, 550.0, 650.0])
-
-
-@pytest.mark.thorough
-def test_without_wavelengths_there_is_no_color():
-    capture = simulate("glass", scene=PLATE, protocol=MANY)
-    assert dict(capture.sizes) == {"view": 3000}
-    assert capture["true_refractive_index"].dims == ()
-    assert float(capture["true_refractive_index"]) == PRESETS["glass"].refractive_index[1]
 
 
 @pytest.mark.thorough
@@ -257,73 +250,60 @@ class OwnLink(AbstractLink):
         return dist.Normal(prediction[name], noise["own_scale"])
 
 
-@each(
-    ("arguments", "kind", "message"),
-    [
-        ({"preset": "leave"}, CaptureError, "^preset='leave': no such material; give one of leaf"),
-        ({"preset": 3}, CaptureError, "^preset=3: no such material; give"),
-        ({"scene": "papper"}, SceneError, "^scene='papper': no such scene; give one of paper"),
-        ({"scene": 3}, SceneError, "^scene=3: no such scene; give"),
-        ({"seed": -1}, CaptureError, "^simulate: seed is -1; give an integer from 0"),
-        ({"seed": 1.0}, CaptureError, "^simulate: seed is 1.0; give"),
-        ({"seed": True}, CaptureError, "^simulate: seed is True; give"),
-        ({"seed": 2**32}, CaptureError, "^simulate: seed is 4294967296; give"),
-        (
-            {"parameters": {"roughnes": 0.1}},
-            SceneError,
-            "^simulate: parameters: the scene has no parameter roughnes; give any of roughness",
-        ),
-        (
-            {"parameters": {"roughness": -0.1}},
-            CaptureError,
-            r"^simulate: parameters\['roughness'\]: -0.1 is outside 0 <= value <= inf; give",
-        ),
-        (
-            {"parameters": {"absorption": [0.1, float("nan"), 0.1]}},
-            CaptureError,
-            r"^simulate: parameters\['absorption'\]: nan is outside 0",
-        ),
-        ({"parameters": {"refractive_index": 0.9}}, CaptureError, "0.9 is outside 1 <= value"),
-        ({"parameters": {"subsurface_fraction": 1.1}}, CaptureError, "1.1 is outside 0 <= value"),
-        (
-            {"parameters": {"refractive_index": [1.4, 1.5]}},
-            CaptureError,
-            r"its shape is \(2,\); give one number, or one per wavelength \(3\)",
-        ),
-        (
-            {"preset": Material(0.1, 1.5, (0.3, 0.3, 0.3), (1.5, 1.5, 1.5))},
-            CaptureError,
-            "'subsurface_fraction'.*1.5 is outside",
-        ),
-        (
-            {"noise": {"intensity_scal": 0.1}},
-            FitError,
-            "^simulate: noise: no link reads intensity_scal; give any of concentration_scale",
-        ),
-        (
-            {"noise": {"intensity_scale": 0.0}},
-            CaptureError,
-            r"^simulate: noise\['intensity_scale'\]: 0 is outside 0 < value <= inf; give",
-        ),
-        ({"noise": {"exposure": float("inf")}}, CaptureError, "inf is outside 0 < value"),
-        ({"links": {}}, FitError, "^simulate: links: that is no set of links; give a mapping"),
-        ({"links": BetaLink()}, FitError, "^simulate: links: that is no set of links; give"),
-        (
-            {"links": {"dop": StokesLink()}},
-            FitError,
-            r"^simulate: links\['dop'\]: StokesLink.* does not describe dop; give a link",
-        ),
-        ({"links": {"dop": "beta"}}, FitError, "'beta' does not describe dop; give a link"),
-        (
-            {"links": {"q": OwnLink()}},
-            FitError,
-            r"^simulate: noise\['own_scale'\]: it has no value; give noise={'own_scale': <number>}",
-        ),
-        ({"links": {"u": StokesLink()}, "scene": PLATE}, CaptureError, "u: it has no meaning"),
-    ],
-)
-def test_what_cannot_be_simulated_is_told_in_one_line(arguments, kind, message):
-    with pytest.raises(kind, match=message) as caught:
+ODD = Material(0.1, 1.5, (0.3, 0.3, 0.3), (1.5, 1.5, 1.5))
+WRONG = [
+    (CaptureError, {"preset": "leave"}, "preset='leave': no such material; give one of leaf"),
+    (CaptureError, {"preset": 3}, "preset=3: no such material; give"),
+    (SceneError, {"scene": "papper"}, "scene='papper': no such scene; give one of paper"),
+    (SceneError, {"scene": 3}, "scene=3: no such scene; give"),
+    (CaptureError, {"seed": -1}, "simulate: seed is -1; give an integer from 0"),
+    (CaptureError, {"seed": 1.0}, "simulate: seed is 1.0; give"),
+    (CaptureError, {"seed": True}, "simulate: seed is True; give"),
+    (CaptureError, {"seed": 2**32}, "simulate: seed is 4294967296; give"),
+    (CaptureError, {"preset": ODD}, "['subsurface_fraction']: 1.5 is outside"),
+    (FitError, {"links": {}}, "simulate: links: that is no set of links; give a mapping"),
+    (FitError, {"links": BetaLink()}, "simulate: links: that is no set of links; give"),
+    (FitError, {"links": {"dop": StokesLink()}}, "does not describe dop; give a link"),
+    (FitError, {"links": {"dop": "beta"}}, "links['dop']: 'beta' does not describe dop; give a li"),
+    (
+        FitError,
+        {"links": {"q": OwnLink()}},
+        "noise['own_scale']: it has no value; give noise={'own_",
+    ),
+    (CaptureError, {"links": {"u": StokesLink()}, "scene": PLATE}, "u: it has no meaning"),
+]
+PARAMETERS = [
+    (SceneError, {"roughnes": 0.1}, ": the scene has no parameter roughnes; give any of roughness"),
+    (CaptureError, {"roughness": -0.1}, "['roughness']: -0.1 is outside 0 <= value <= inf; give"),
+    (CaptureError, {"absorption": [0.1, np.nan, 0.1]}, "['absorption']: nan is outside 0"),
+    (CaptureError, {"refractive_index": 0.9}, "0.9 is outside 1 <= value"),
+    (CaptureError, {"subsurface_fraction": 1.1}, "1.1 is outside 0 <= value"),
+    (
+        CaptureError,
+        {"refractive_index": [1.4, 1.5]},
+        "its shape is (2,); give one number, or one pe",
+    ),
+]
+WRONG += [(kind, {"parameters": given}, message) for kind, given, message in PARAMETERS]
+NOISES = [
+    (
+        FitError,
+        {"intensity_scal": 0.1},
+        ": no link reads intensity_scal; give any of concentration",
+    ),
+    (
+        CaptureError,
+        {"intensity_scale": 0.0},
+        "['intensity_scale']: 0 is outside 0 < value <= inf; g",
+    ),
+    (CaptureError, {"exposure": np.inf}, "inf is outside 0 < value"),
+]
+WRONG += [(kind, {"noise": given}, message) for kind, given, message in NOISES]
+
+
+@each(("kind", "arguments", "message"), WRONG)
+def test_what_cannot_be_simulated_is_told_in_one_line(kind, arguments, message):
+    with pytest.raises(kind, match=re.escape(message)) as caught:
         simulate(**arguments)
     assert isinstance(caught.value, PolarBayesError)
     assert "\n" not in str(caught.value)
