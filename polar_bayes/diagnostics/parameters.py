@@ -3,13 +3,12 @@
 import dataclasses
 import itertools
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from polar_bayes.errors import one_line
-from polar_bayes.inference.program import Program
+from polar_bayes.inference.program import Program, Values
 from polar_bayes.inference.result import posterior_of, shape_of
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS
 
@@ -139,7 +138,7 @@ def label_coordinates(program: Program, capture: xr.Dataset) -> list[Coordinate]
     return sorted(found)
 
 
-def label_scalars(program: Program, capture: xr.Dataset, draws: Mapping[str, Any]) -> list[Scalar]:
+def label_scalars(program: Program, capture: xr.Dataset, draws: Values) -> list[Scalar]:
     """Scalars of chains of draws, with the capture's own labels of axes, such as wavelengths."""
     group = posterior_of(program, draws)
     labels = {str(dim): capture[dim] for dim in group.dims if dim in capture.coords}

@@ -14,10 +14,7 @@ import xarray as xr
 
 from polar_bayes.diagnostics.parameters import Scalar, scalars
 from polar_bayes.inference.files import check_fit
-from polar_bayes.inference.result import provenance_of
-
-type Provenance = Mapping[str, Any]
-"""How a result was made, as JSON holds it."""
+from polar_bayes.inference.result import Provenance, provenance_of
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

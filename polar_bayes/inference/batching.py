@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jaxtyping import Array
+from jaxtyping import Array, DTypeLike
 
 from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.observation.data import Observations
@@ -47,7 +47,7 @@ class ObservationBatch:
         """Some of the pixels, in that order."""
         return ObservationBatch(self.take(index), self.static, self.views[index])
 
-    def in_precision(self, dtype: Any) -> "ObservationBatch":
+    def in_precision(self, dtype: DTypeLike) -> "ObservationBatch":
         """The same readings in another floating type."""
 
         def cast(x: np.ndarray) -> np.ndarray:

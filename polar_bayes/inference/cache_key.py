@@ -6,7 +6,6 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
-from typing import Any
 
 import jax
 import numpy as np
@@ -23,7 +22,7 @@ def cache_key(
     scene: Scene,
     priors: Mapping[str, dist.Distribution],
     links: Mapping[str, AbstractLink],
-    *further: Any,
+    *further: object,
 ) -> str:
     """A text that is equal for requests whose compiled programs are the same."""
     scene = dataclasses.replace(scene)  # without its ledger

@@ -85,7 +85,7 @@ class CompiledModel:
             return compile_program(self.bind(), self.layout.in_single_precision())
 
     @property
-    def dtype(self) -> Any:
+    def dtype(self) -> type[np.floating]:
         """Floating type of the answer."""
         return np.float64 if self.precision == "double" else np.float32
 
@@ -188,7 +188,7 @@ def _prior_draws(compiled_model: CompiledModel, count: int) -> np.ndarray:
 
 
 def evaluate_draws(
-    program: Any, z: Float[Array, "draw size"], data: Observations
+    program: Program, z: Float[Array, "draw size"], data: Observations
 ) -> tuple[dict[str, Array], Float[Array, " draw"]]:
     """Parameters and log posterior densities of draws of one pixel; minus infinity for NaN."""
     parameters, values = jax.lax.map(
@@ -226,7 +226,7 @@ def compile_layout(
         return _COMPILED.of(key, make)
 
 
-def layout_key(request: Request, *further: Any) -> str:
+def layout_key(request: Request, *further: object) -> str:
     """A text that is the same for requests whose captures have one layout and one model."""
     layout = [
         (name, v.dims, v.shape, str(v.dtype)) for name, v in request.capture.variables.items()

@@ -10,7 +10,7 @@ The schemas of calibrations and accuracy studies are in `polar_bayes.calibration
 import dataclasses
 import fnmatch
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ import xarray as xr
 
 from polar_bayes.capture.schema import dims_text
 from polar_bayes.errors import FitError
-from polar_bayes.inference.result import PROVENANCE, provenance_of
+from polar_bayes.inference.result import PROVENANCE, Provenance, provenance_of
 from polar_bayes.observation.data import ANGLES
 from polar_bayes.priors import short_numbers
 
@@ -43,7 +43,7 @@ CHOSEN_BY = {
 }
 
 
-def _is_number(value: object) -> bool:
+def _is_number(value: Any) -> bool:
     is_real = isinstance(value, int | float | np.number) and not isinstance(value, bool)
     return is_real and not (isinstance(value, int) and abs(value) >= 2**64)
 
@@ -157,7 +157,9 @@ class Group:
             if any(fnmatch.fnmatchcase(str(name), pattern) for pattern in patterns)
         }
 
-    def check(self, variables: Variables, attributes: Mapping[Any, Any], where: str) -> Problems:
+    def check(
+        self, variables: Variables, attributes: Mapping[Hashable, object], where: str
+    ) -> Problems:
         """Where a group departs from this schema."""
         yield from _check_json(attributes, self.attributes, where)
         for name in self.variables:
@@ -271,7 +273,7 @@ def _check_node(node: xr.DataTree, where: str) -> Problems:
 
 def _check_labels(labeled: Mapping[str, xr.DataTree]) -> Problems:
     """Dims that groups share have the same labels; wavelengths are lengths."""
-    seen: dict[Any, tuple[str, xr.Variable | None]] = {}
+    seen: dict[Hashable, tuple[str, xr.Variable | None]] = {}
     for name, node in labeled.items():
         for dim in (dim for dim in node.dims if dim not in DRAWS):
             found = node.variables[dim] if dim in node.coords else None
@@ -506,7 +508,7 @@ def auto_sentences(result: xr.DataTree) -> list[str]:
     return sentences_of_auto(provenance_of(result))
 
 
-def sentences_of_auto(provenance: Mapping[str, Any]) -> list[str]:
+def sentences_of_auto(provenance: Provenance) -> list[str]:
     """What `method="auto"` tried, from the provenance of a fit that was checked."""
     summary = provenance.get("auto")
     if not summary:

@@ -39,6 +39,7 @@ from polar_bayes.inference.program import (
     from_prior,
     in_blocks,
 )
+from polar_bayes.inference.result import Provenance
 from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.numerics.optimize import (
     Modes,
@@ -65,13 +66,16 @@ the common parameters can have any shape with few groups; with many it is close 
 Draws = tuple[np.ndarray, dict[str, np.ndarray]]
 """Unconstrained draws (chain, draw, size), and statistics, each (chain, draw)."""
 
+type Density = Callable[[Array, Any], Array]
+"""Minus the log density of chains, from coordinates and what is given."""
+
 
 class Target(NamedTuple):
     """A density for chains, with starting points and metric."""
 
-    density: Callable[[Array, Any], Array]
+    density: Density
     """Minus its log, from coordinates and `given`; one object for all captures of a layout."""
-    given: Any
+    given: object
     potential: ValueAndGradient
     starts: np.ndarray
     metric: np.ndarray
@@ -98,8 +102,8 @@ class Coordinates:
             vectors, compiled; None where they are the same.
     """
 
-    density: Callable[[Array, Any], Array]
-    given: Any
+    density: Density
+    given: object
     potential: ValueAndGradient
     log_density_of: Callable[[np.ndarray], np.ndarray]
     modes: Modes
@@ -125,7 +129,7 @@ class Coordinates:
 class AbstractInit(abc.ABC):
     """Where draws start: what every method may ask of the modes, however they were found."""
 
-    metadata: dict[str, Any]
+    metadata: Provenance
     """Number of starts, failures and weights, for the provenance."""
 
     @property
@@ -162,7 +166,7 @@ class JointInit(AbstractInit):
     data: Observations
     potential: ValueAndGradient
     modes: Modes
-    metadata: dict[str, Any]
+    metadata: Provenance
 
     @override
     def target(self, key: Array, chains: int) -> Target:
@@ -258,7 +262,7 @@ class HierarchicalInit(AbstractInit):
     """Many groups: coordinates in which the posterior is close to standard normal."""
 
     fitted: FittedReparam
-    metadata: dict[str, Any]
+    metadata: Provenance
 
     @override
     def target(self, key: Array, chains: int) -> Target:
@@ -385,7 +389,7 @@ class JointInitializer(AbstractInitializer):
         size, reparam = self.program.size, self.reparam
         starts, metric = np.zeros((1, size)), np.eye(size)
 
-        def target(density: Callable, given: Any) -> Target:
+        def target(density: Callable, given: object) -> Target:
             return Target(density, given, lambda z: (0.0, z), starts, metric)
 
         if reparam is None:

@@ -22,7 +22,7 @@ from numpyro.infer.util import compute_log_probs
 from numpyro.primitives import Messenger
 
 from polar_bayes.errors import FitError
-from polar_bayes.numerics.batches import map_batches
+from polar_bayes.numerics.batches import AnyArray, map_batches
 from polar_bayes.numerics.compile import JitOnce, compiled
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink
@@ -37,10 +37,11 @@ BLOCK = 500
 THREADS = 2
 """That run such calls."""
 
-Values = dict[str, Array] | dict[str, np.ndarray]
+Values = Mapping[str, AnyArray]
 
 
-Sites = dict[str, dict[str, Any]]
+Site = dict[str, Any]
+Sites = dict[str, Site]
 
 
 class Draw(NamedTuple):
@@ -373,7 +374,7 @@ def compile_program(model: Model, data: Observations) -> Program:
     )
 
 
-def is_auxiliary(site: Mapping[str, Any]) -> bool:
+def is_auxiliary(site: Site) -> bool:
     """True for a latent site with `infer={"auxiliary": True}`: a coordinate, not a parameter."""
     return bool(site["infer"].get("auxiliary", False))
 
@@ -391,12 +392,12 @@ def family_of(distribution: dist.Distribution) -> str:
     return type(distribution).__name__
 
 
-def _trace(model: Callable, key: Array, data: Observations, **arguments: Any) -> Sites:
+def _trace(model: Callable, key: Array, data: Observations, **arguments: object) -> Sites:
     return handlers.trace(handlers.seed(model, key)).get_trace(data, **arguments)
 
 
 def _abstract_sites(
-    model: Callable, data: Observations, **arguments: Any
+    model: Callable, data: Observations, **arguments: object
 ) -> tuple[Sites, Sites, Sites]:
     """All sites of a model, the sampled ones, and of these the latent ones; nothing is computed."""
     sites: Sites = {}
@@ -425,7 +426,7 @@ class ModelInfo(NamedTuple):
 
     priors: tuple[str, ...]
     declared: dict[str, str]
-    fixed: dict[str, Any]
+    fixed: dict[str, object]
 
 
 def inspect_model(

@@ -4,7 +4,6 @@ import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 from numbers import Integral
-from typing import Any
 
 import jax
 import xarray as xr
@@ -15,6 +14,7 @@ from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.inference.cache_key import cache_key, layout_of
 from polar_bayes.inference.program import ModelInfo, inspect_model
+from polar_bayes.inference.result import Provenance
 from polar_bayes.models.gp_spectral import gp_spectral
 from polar_bayes.models.hierarchical import Hierarchical
 from polar_bayes.models.per_material import per_material
@@ -53,7 +53,7 @@ class Request:
     scene_chosen_by: str
     priors: dict[str, dist.Distribution]
     declared: dict[str, str]
-    fixed: dict[str, Any]
+    fixed: dict[str, object]
     links: dict[str, AbstractLink]
     swapped: tuple[str, ...]
     largest_view_zenith: float
@@ -66,7 +66,7 @@ class Request:
         """The model with everything but its data in place."""
         return bind_model(self.model, scene, self.priors, self.links)
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> Provenance:
         """The request in what JSON can hold, for the provenance of a result."""
         return {
             "model": self.model_name,

@@ -14,7 +14,7 @@ import xarray as xr
 from arviz_base import from_dict
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.program import Draw, Program
+from polar_bayes.inference.program import Draw, Program, Values
 from polar_bayes.observation.data import ANGLES, Observations
 from polar_bayes.physics.part import notation
 from polar_bayes.priors import RANGES
@@ -23,6 +23,9 @@ PROVENANCE = "polar_bayes"
 
 CENTRAL_95 = (0.025, 0.975)
 """Probabilities of the ends of the equal-tailed 95% interval."""
+
+type Provenance = dict[str, Any]
+"""What a result says of how it was made, as JSON holds it."""
 
 
 def assemble(
@@ -88,7 +91,7 @@ def attributes_of(name: str) -> dict[str, str]:
     return known | {"symbol": symbol} if symbol else known
 
 
-def provenance_of(result: xr.DataTree | xr.Dataset) -> dict[str, Any]:
+def provenance_of(result: xr.DataTree | xr.Dataset) -> Provenance:
     """How a result was made; null entries are left out."""
     try:
         found = json.loads(result.attrs.get(PROVENANCE, "{}"))
@@ -103,7 +106,7 @@ def provenance_of(result: xr.DataTree | xr.Dataset) -> dict[str, Any]:
     return {key: value for key, value in found.items() if value is not None}
 
 
-def bounds_of(provenance: Mapping[str, Any], name: str) -> tuple[float, float]:
+def bounds_of(provenance: Provenance, name: str) -> tuple[float, float]:
     """Support of the prior of a parameter."""
     bounds = (provenance.get("bounds") or {}).get(name)
     if bounds is None:
@@ -112,7 +115,7 @@ def bounds_of(provenance: Mapping[str, Any], name: str) -> tuple[float, float]:
     return -math.inf if low is None else low, math.inf if high is None else high
 
 
-def posterior_of(program: Program, parameters: Mapping[str, Any]) -> xr.Dataset:
+def posterior_of(program: Program, parameters: Values) -> xr.Dataset:
     """The group `posterior` of a fit without any other group."""
     tree = from_dict({"posterior": _shaped(program, parameters)}, dims=dims_of(program))
     return tree["posterior"].to_dataset()
@@ -131,14 +134,14 @@ def shape_of(program: Program, name: str) -> tuple[int, ...]:
     return (*(program.plates[dim] for dim in program.dims[name]), *program.events[name])
 
 
-def _shaped(program: Program, values: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def _shaped(program: Program, values: Values) -> dict[str, np.ndarray]:
     return {
         name: np.asarray(value).reshape(*np.shape(value)[:2], *shape_of(program, name))
         for name, value in values.items()
     }
 
 
-def _readings(values: Mapping[str, Any], data: Observations) -> dict[str, np.ndarray]:
+def _readings(values: Values, data: Observations) -> dict[str, np.ndarray]:
     unit = {"intensity": float(data.intensity_unit)}
     return {name: np.asarray(value) * unit.get(name, 1.0) for name, value in values.items()}
 

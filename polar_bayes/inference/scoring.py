@@ -12,7 +12,6 @@ import functools
 import itertools
 import math
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -130,7 +129,7 @@ def _is_number(x: Array) -> bool:
     return jnp.issubdtype(jnp.result_type(x), jnp.floating)
 
 
-def _jacobian(function: Callable, coordinates: Coordinates) -> tuple[Any, Any]:
+def _jacobian[T](function: Callable[..., T], coordinates: Coordinates) -> tuple[T, T]:
     """A tree of arrays, and its derivatives along every coordinate, (size, ...)."""
     size = len(coordinates)
     if size > MAX_UNROLLED:
@@ -138,7 +137,7 @@ def _jacobian(function: Callable, coordinates: Coordinates) -> tuple[Any, Any]:
         push = jax.vmap(lambda unit: jax.jvp(function, coordinates, unit), out_axes=(None, 0))
         return push(units)
 
-    def along(k: int) -> tuple[Any, Any]:
+    def along(k: int) -> tuple[T, T]:
         """The derivative along one coordinate, the others being constants."""
         below, x, above = coordinates[:k], coordinates[k], coordinates[k + 1 :]
         return jax.jvp(lambda x: function(*below, x, *above), (x,), (jnp.ones_like(x),))

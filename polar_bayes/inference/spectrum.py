@@ -5,19 +5,17 @@ ones (Rasmussen and Williams 2006, *Gaussian Processes for Machine Learning*, se
 """
 
 import ast
-from collections.abc import Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from polar_bayes.errors import FitError
 from polar_bayes.expressions import parse_value
 from polar_bayes.inference.files import check_fit
-from polar_bayes.inference.result import attributes_of, bounds_of, provenance_of
+from polar_bayes.inference.result import Provenance, attributes_of, bounds_of, provenance_of
 from polar_bayes.models.gp_spectral import GpSpectral
 from polar_bayes.models.spectral_process import (
     SPECTRA,
@@ -34,7 +32,7 @@ BATCH = 64
 
 def predict_spectrum(
     result: xr.DataTree,
-    wavelengths: Any,
+    wavelengths: ArrayLike,
     *,
     model: GpSpectral | None = None,
     scene: Scene | None = None,
@@ -87,7 +85,7 @@ def predict_spectrum(
     return xr.Dataset(found)
 
 
-def _checked(wavelengths: Any) -> np.ndarray:
+def _checked(wavelengths: ArrayLike) -> np.ndarray:
     try:
         new = np.atleast_1d(np.asarray(wavelengths, float))
     except (TypeError, ValueError):
@@ -101,7 +99,7 @@ def _checked(wavelengths: Any) -> np.ndarray:
     return new
 
 
-def _law_of(provenance: Mapping[str, Any], scene: Scene | None) -> AbstractDispersion | None:
+def _law_of(provenance: Provenance, scene: Scene | None) -> AbstractDispersion | None:
     """The law of dispersion: of the scene that is given, or parsed from the provenance."""
     if scene is not None:
         return scene.dispersion
@@ -122,7 +120,7 @@ def _law_of(provenance: Mapping[str, Any], scene: Scene | None) -> AbstractDispe
     return None
 
 
-def _model_of(provenance: Mapping[str, Any], model: GpSpectral | None) -> GpSpectral:
+def _model_of(provenance: Provenance, model: GpSpectral | None) -> GpSpectral:
     """The model of the fit: the one that is given, or made from the settings in the provenance."""
     if model is not None:
         if not isinstance(model, GpSpectral):
@@ -171,7 +169,7 @@ def _predict(
     name: str,
     process: SpectralProcess,
     result: xr.DataTree,
-    provenance: Mapping[str, Any],
+    provenance: Provenance,
     new: np.ndarray,
     seed: list[int],
 ) -> xr.DataArray:

@@ -5,13 +5,14 @@ import math
 import time
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple, override
+from typing import NamedTuple, override
 
 import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.problem import Problem
+from polar_bayes.inference.result import Provenance
 from polar_bayes.methods.importance import Importance
 from polar_bayes.methods.method import AbstractMethod, PosteriorDraws, flatten, make_method
 from polar_bayes.methods.nuts import Nuts
@@ -209,7 +210,7 @@ class Attempt(NamedTuple):
     k_hat: float = np.nan
     effective_draws: float = np.nan
 
-    def as_metadata(self) -> dict[str, Any]:
+    def as_metadata(self) -> Provenance:
         """What JSON can hold."""
         numbers = ("seconds", "monte_carlo", "r_hat", "k_hat", "effective_draws")
         texts = {"name": self.name, "taken": self.taken, "why": self.why}

@@ -9,7 +9,7 @@ draws of a sampler (`Importance`, say), which also fits pixels whose mode was no
 import dataclasses
 import math
 from collections.abc import Callable, Generator, Iterator
-from typing import Any, ClassVar, NamedTuple, Self, override
+from typing import ClassVar, NamedTuple, Self, override
 
 import jax
 import numpy as np
@@ -26,6 +26,7 @@ from polar_bayes.inference.batching import MethodUsed, Status, batched
 from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
 from polar_bayes.inference.program import Values
+from polar_bayes.inference.result import Provenance
 from polar_bayes.methods.importance import Importance
 from polar_bayes.methods.method import AbstractBatchMethod
 from polar_bayes.numerics.batches import put_rows, take_rows
@@ -140,7 +141,7 @@ class CorrectedLaplace(AbstractBatchMethod):
     @override
     def for_image(
         self, size: int, sample: Callable[[int], ProblemBatch], *, is_shared: bool
-    ) -> tuple[Self, dict[str, Any]]:
+    ) -> tuple[Self, Provenance]:
         if self.starts is not None:
             return self, {}
         every = dataclasses.replace(self, starts=self.most_starts)

@@ -15,7 +15,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, ClassVar, override
+from typing import ClassVar, override
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +36,7 @@ from polar_bayes.inference.compiled_model import (
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
 from polar_bayes.inference.program import THREADS, Values, split_key
-from polar_bayes.inference.result import CENTRAL_95
+from polar_bayes.inference.result import CENTRAL_95, Provenance
 from polar_bayes.methods.method import AbstractBatchMethod, AbstractMethod, PosteriorDraws
 from polar_bayes.methods.profile_mixture import (
     LEAST_WEIGHT,
@@ -191,7 +191,7 @@ def suits_profiles(problem: Problem) -> bool:
     return problem.program.size <= MOST_COORDINATES
 
 
-def tail_shares(problem: Problem, parameters: Values, key: Array) -> dict[str, Any]:
+def tail_shares(problem: Problem, parameters: Values, key: Array) -> Provenance:
     """Shares of weighted draws beyond the 95% intervals of chains, an entry of the provenance.
 
     Chains that never entered an arm of the posterior agree with each other; draws along its

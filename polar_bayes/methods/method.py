@@ -20,6 +20,7 @@ from polar_bayes.inference.batching import MIN_VIEWS, MethodUsed, Status
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
 from polar_bayes.inference.program import THREADS, Values
+from polar_bayes.inference.result import Provenance
 from polar_bayes.methods.registry import METHODS, method_names
 from polar_bayes.numerics.compile import TRACING_LOCK
 from polar_bayes.numerics.mcse import (
@@ -65,7 +66,7 @@ class PosteriorDraws:
     effective_draws: float = np.nan
     gradients: float = np.nan
     densities: float = np.nan
-    metadata: dict[str, Any] = dataclasses.field(default_factory=dict)
+    metadata: Provenance = dataclasses.field(default_factory=dict)
 
     @property
     def doubts(self) -> list[str]:
@@ -160,7 +161,7 @@ class AbstractBatchMethod(HTMLRepr, abc.ABC):
 
     def for_image(
         self, size: int, sample: Callable[[int], ProblemBatch], *, is_shared: bool
-    ) -> tuple[Self, dict[str, Any]]:
+    ) -> tuple[Self, Provenance]:
         """Settings for an image, and entries of its provenance.
 
         `size` is the number of its pixels, `sample` gives some of them drawn at random, and
@@ -249,7 +250,7 @@ class AbstractMethod(AbstractBatchMethod):
         del problem, draws
         return (self,)
 
-    def cross_check(self, problem: Problem, parameters: Values, key: Array) -> dict[str, Any]:
+    def cross_check(self, problem: Problem, parameters: Values, key: Array) -> Provenance:
         """What other draws of the same posterior say of those of this method.
 
         `polar_bayes.fit` asks for it; simulations of many fits do not.
@@ -358,7 +359,7 @@ def make_method(name: str) -> Any:
     return getattr(methods, METHODS[name].settings)()
 
 
-def find_method(method: Any, where: str, *, one: bool = False, many: bool = False) -> Any:
+def find_method(method: object, where: str, *, one: bool = False, many: bool = False) -> Any:
     """The settings that a caller asks for, by name or as they are.
 
     Raises:
@@ -382,7 +383,7 @@ def find_method(method: Any, where: str, *, one: bool = False, many: bool = Fals
     raise FitError(f"{name} {what}", where=f"{where}: method={method!r}", hint=hint)
 
 
-def name_of(method: Any) -> str:
+def name_of(method: object) -> str:
     """The name of a method, whatever its settings; that of its class where it has none."""
     made = type(method).__name__
     return next((name for name, each in METHODS.items() if each.settings == made), made)

@@ -13,7 +13,7 @@ acceptance leads to (Betancourt 2016, arXiv:1604.00695), and needs no new compil
 import dataclasses
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple, Self, override
+from typing import NamedTuple, Self, override
 
 import jax
 import numpy as np
@@ -21,10 +21,11 @@ from jaxtyping import Array, Float
 from numpyro import infer
 
 from polar_bayes.inference.compiled_model import CompiledModel
-from polar_bayes.inference.initialization import Target
+from polar_bayes.inference.initialization import Density, Target
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
 from polar_bayes.inference.program import Values, first_key, split_key
+from polar_bayes.inference.result import Provenance
 from polar_bayes.methods.importance import ONE_ROUND, suits_profiles, tail_shares
 from polar_bayes.methods.method import AbstractMethod, PosteriorDraws
 from polar_bayes.numerics.compile import JitOnce, compiled
@@ -129,7 +130,7 @@ class Nuts(AbstractMethod):
         return (ONE_ROUND, chains) if suits_profiles(problem) else (chains,)
 
     @override
-    def cross_check(self, problem: Problem, parameters: Values, key: Array) -> dict[str, Any]:
+    def cross_check(self, problem: Problem, parameters: Values, key: Array) -> Provenance:
         return tail_shares(problem, parameters, key)
 
     def _sampler(self, target: Target, problem: Problem) -> "Sampler":
@@ -283,7 +284,7 @@ class Static(NamedTuple):
 class Sampler:
     """NumPyro's NUTS as two functions of arrays: start a chain, advance it by a block."""
 
-    def __init__(self, density: Callable[[Array, Any], Array], static: Static) -> None:
+    def __init__(self, density: Density, static: Static) -> None:
         self.static = static
         # From a state and the data to the state after a block and its steps.
         self.advance = JitOnce(self._advance)
@@ -304,7 +305,7 @@ class Sampler:
         chain: Array,
         density: tuple[Array, Array],
         metric: Array,
-        given: Any,
+        given: object,
         key: Array,
     ) -> infer.hmc.HMCState:
         # Value and gradient are given, so that starting a chain compiles no model.
@@ -322,7 +323,7 @@ class Sampler:
             rng_key=jax.random.split(key, len(starts))[chain],
         )
 
-    def _advance(self, state: infer.hmc.HMCState, given: Any) -> tuple[infer.hmc.HMCState, Step]:
+    def _advance(self, state: infer.hmc.HMCState, given: object) -> tuple[infer.hmc.HMCState, Step]:
         def step(state: infer.hmc.HMCState, _: None) -> tuple[infer.hmc.HMCState, Step]:
             state = self._next(state, model_args=(given,))
             return state, Step(

@@ -114,12 +114,12 @@ class JitOnce:
         """Run the program, which the first call compiles."""
         return self.program(*arguments)(*arguments)
 
-    def begin(self, *arguments: Any) -> None:
+    def begin(self, *arguments: object) -> None:
         """Trace now, and compile on another thread; the arguments may be `ShapeDtypeStruct`."""
         if self._key(arguments) not in self._compilations:
             _COMPILER_THREAD.submit(self._trace(arguments).result)
 
-    def program(self, *arguments: Any) -> Callable:
+    def program(self, *arguments: object) -> Callable:
         """The compiled program for arguments of these shapes and types."""
         found = self._compilations.get(self._key(arguments))
         return (found or self._trace(arguments)).result()

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from importlib.metadata import version
 from types import FunctionType
-from typing import Any
 
 import jax
 import numpy as np
@@ -25,9 +24,9 @@ from polar_bayes.capture.schema import count
 from polar_bayes.errors import FitError
 from polar_bayes.inference.prior_probability import has_probabilities, probability_below
 from polar_bayes.inference.problem import Problem, make_problem
-from polar_bayes.inference.program import BLOCK, THREADS, from_prior
+from polar_bayes.inference.program import BLOCK, THREADS, Values, from_prior
 from polar_bayes.inference.request import Request
-from polar_bayes.inference.result import assemble, posterior_of
+from polar_bayes.inference.result import Provenance, assemble, posterior_of
 from polar_bayes.methods.method import AbstractMethod, find_method
 from polar_bayes.numerics.compile import OutOfTimeError, check_memory, compiled, run_until
 from polar_bayes.numerics.mcse import SMALLEST_ESS
@@ -90,7 +89,7 @@ def fit_request(
     }
 
     def result(
-        comparisons: Mapping[str, xr.Dataset], failed: dict[str, str], alternatives: dict[str, Any]
+        comparisons: Mapping[str, xr.Dataset], failed: dict[str, str], alternatives: Provenance
     ) -> xr.DataTree:
         seconds = {stage: round(each, 3) for stage, each in timings.seconds.items()}
         provenance = {**known, "timings": seconds, **alternatives}
@@ -153,16 +152,16 @@ def choose_method(
 def try_alternatives(
     request: Request,
     problem: Problem,
-    posterior: Mapping[str, Any],
+    posterior: Values,
     key: Array,
     progress: Progress,
     *,
     deadline: float = math.inf,
     compared: Collection[Scene] = (),
-) -> dict[str, Any]:
+) -> Provenance:
     """Entries of the provenance: the comparison with alternative parts, or why there is none."""
 
-    def compare(progress: Progress) -> list[dict[str, Any]]:
+    def compare(progress: Progress) -> list[Provenance]:
         return compare_alternatives(request, problem, posterior, key, progress, compared)
 
     try:
@@ -276,7 +275,7 @@ def _without(
     return make_problem(dataclasses.replace(request, scene=scene), problem.key), gone
 
 
-def _model_settings(model: Callable) -> dict[str, Any]:
+def _model_settings(model: Callable) -> Provenance:
     """The fields of a model that is a value, in what JSON can hold."""
     if not dataclasses.is_dataclass(model) or isinstance(model, type):
         return {}
@@ -301,7 +300,7 @@ def _finite_bounds(prior: dist.Distribution) -> list[float | None]:
     return [bound if math.isfinite(bound) else None for bound in support_bounds(prior)]
 
 
-def _prior_probability(request: Request, posterior: Mapping[str, Any]) -> dict[str, list[float]]:
+def _prior_probability(request: Request, posterior: Values) -> dict[str, list[float]]:
     """Prior probability below each posterior median, where a prior has such a function."""
     found = {}
     for name, prior in request.priors.items():
@@ -321,7 +320,7 @@ def _indices_by_eye(request: Request) -> dict[str, list[float]]:
     return {name: list(index) for name, index in found.items() if index is not None}
 
 
-def _provenance(request: Request, method: AbstractMethod, problem: Problem) -> dict[str, Any]:
+def _provenance(request: Request, method: AbstractMethod, problem: Problem) -> Provenance:
     """Everything that is needed to repeat the fit."""
     data = problem.data
     at_boundary = {

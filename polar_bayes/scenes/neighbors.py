@@ -15,8 +15,7 @@ Assoc. 90, 773 (Bayes factors).
 import dataclasses
 import itertools
 import math
-from collections.abc import Collection, Mapping
-from typing import Any
+from collections.abc import Collection
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +26,9 @@ from numpyro import distributions as dist
 from polar_bayes.errors import FitError
 from polar_bayes.inference.initialization import HEAVY_MODE, JointInit
 from polar_bayes.inference.problem import Problem, compile_request
+from polar_bayes.inference.program import Values
 from polar_bayes.inference.request import Request
+from polar_bayes.inference.result import Provenance
 from polar_bayes.numerics.optimize import (
     DifferencedPotential,
     Modes,
@@ -50,11 +51,11 @@ PRIOR_DRAWS = 101
 def compare_alternatives(
     request: Request,
     problem: Problem,
-    posterior: Mapping[str, Any],
+    posterior: Values,
     key: Array,
     progress: Progress,
     compared: Collection[Scene] = (),
-) -> list[dict[str, Any]]:
+) -> list[Provenance]:
     """For each alternative its log Bayes factor and the answer that it gives, as JSON holds it.
 
     `shift` is the difference of the modes in posterior sds, by parameter. Scenes that were compared
@@ -78,7 +79,7 @@ def compare_alternatives(
     rows = []
     for number, alternative in enumerate(alternatives):
         progress("comparing alternatives", number / len(alternatives))
-        row: dict[str, Any] = {
+        row: Provenance = {
             "part": type(alternative.part).__name__,
             "alternative": type(alternative.replacement).__name__,
             "path": alternative.path,

@@ -18,7 +18,6 @@ import functools
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -56,12 +55,12 @@ CALLS = 3
 class Compiled:
     """A compiled program, its operations, and the time of its compilation."""
 
-    call: Callable[..., Any]
+    call: Callable
     operations: float
     compile_seconds: float
 
 
-def compile_and_count(function: Callable[..., Any], *arguments: Any) -> Compiled:
+def compile_and_count(function: Callable, *arguments: object) -> Compiled:
     """Compile a function for arguments of these shapes."""
     begin = time.perf_counter()
     program = jax.jit(function).lower(*arguments).compile()
@@ -71,12 +70,12 @@ def compile_and_count(function: Callable[..., Any], *arguments: Any) -> Compiled
     return Compiled(program, float(operations), seconds)
 
 
-def run_seconds(calls: Sequence[Callable[[], Any]]) -> list[float]:
+def run_seconds(calls: Sequence[Callable[[], object]]) -> list[float]:
     """Time of each call at its fastest, results awaited."""
 
     # The calls take turns, so that a machine that slows down slows them all alike; the fastest
     # round is the one that other programs disturbed least.
-    def seconds(call: Callable[[], Any]) -> float:
+    def seconds(call: Callable[[], object]) -> float:
         begin = time.perf_counter()
         for _ in range(CALLS):
             jax.block_until_ready(call())

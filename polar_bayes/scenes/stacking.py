@@ -6,8 +6,7 @@ Source:
 
 import json
 import time
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Hashable, Mapping
 
 import jax
 import numpy as np
@@ -87,7 +86,7 @@ def fit_best_scenes(
         alternatives = try_alternatives(
             request,
             make_problem(request, key),
-            {str(name): draws for name, draws in result["posterior"].data_vars.items()},
+            {str(name): draws.to_numpy() for name, draws in result["posterior"].data_vars.items()},
             key,
             progress,
             compared=list(comparison.scenes.values()),
@@ -96,7 +95,7 @@ def fit_best_scenes(
     return result
 
 
-def _add_provenance(result: xr.DataTree, **more: Any) -> None:
+def _add_provenance(result: xr.DataTree, **more: object) -> None:
     """Replace entries; a comparison with alternatives that was made is not one that failed."""
     provenance = json.loads(result.attrs[PROVENANCE]) | more
     if "alternatives" in more:
@@ -153,7 +152,7 @@ def _draws_of_each(
 def _shared(datasets: list[xr.Dataset]) -> list[str]:
     """Variables of one shape but for their draws in all datasets."""
 
-    def shape(variable: xr.DataArray) -> dict[Any, int]:
+    def shape(variable: xr.DataArray) -> dict[Hashable, int]:
         return {dim: n for dim, n in variable.sizes.items() if dim not in SAMPLE_DIMS}
 
     first, *others = datasets
