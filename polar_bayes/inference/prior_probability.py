@@ -10,9 +10,6 @@ from scipy import special
 from polar_bayes.numerics.batches import map_elements
 from polar_bayes.priors import cast_prior
 
-ROWS = 1024
-"""Values whose probabilities JAX computes together, so that it compiles once."""
-
 
 def has_probabilities(prior: dist.Distribution) -> bool:
     """Whether NumPyro has a cumulative distribution function of this prior."""
@@ -29,7 +26,7 @@ def probability_below(prior: dist.Distribution, x: np.ndarray) -> np.ndarray:
     with jax.enable_x64(True):
         if prior.batch_shape:
             return np.asarray(cast_prior(prior).cdf(x))
-        return map_elements(cast_prior(prior).cdf, x, ROWS)
+        return map_elements(cast_prior(prior).cdf, x, 1024)  # at a time: JAX compiles once
 
 
 @probability_below.register

@@ -27,8 +27,6 @@ from polar_bayes.numerics.compile import compiled
 from polar_bayes.physics.dispersion import AbstractDispersion, Cauchy, Sellmeier
 from polar_bayes.physics.scene import Scene
 
-BATCH = 64
-
 
 def predict_spectrum(
     result: xr.DataTree,
@@ -228,7 +226,7 @@ def _predict(
     if process.fits_length:
         draws["length"] = posterior[f"{name}_length"].transpose("chain", "draw").to_numpy().ravel()
     with jax.enable_x64(True):
-        found = compiled(lambda all_draws: jax.lax.map(one, all_draws, batch_size=BATCH))(draws)
+        found = compiled(lambda all_draws: jax.lax.map(one, all_draws, batch_size=64))(draws)
     spectra = np.asarray(found, dtype)[..., again]
     return _label(spectra.reshape(*level.shape, new.size), level, new)
 

@@ -140,9 +140,6 @@ WIDE_SHARE, WIDE_SCALE = 0.15, 2.0
 PRIOR_SCALE = 0.5
 """Scale of a component without draws, in units of that of all draws."""
 
-LIFT = 1e-6
-"""Added to the diagonal of correlation matrices, which single precision rounds."""
-
 PIXELS = 16
 """Pixels whose mixture densities are computed together: their draws fit into a core's cache."""
 
@@ -167,7 +164,8 @@ def moments(
     sd = jnp.where(sd > 0.0, sd, 1.0)
     scaled = centered / sd
     correlation = scaled.T @ (scaled * weights[:, None])
-    return center, sd[:, None] * jnp.linalg.cholesky(correlation + LIFT * jnp.eye(sd.size))
+    lifted = correlation + 1e-6 * jnp.eye(sd.size)  # single precision rounds
+    return center, sd[:, None] * jnp.linalg.cholesky(lifted)
 
 
 def resample(weights: Float[Array, " draw"], count: int, key: Array) -> Array:

@@ -187,10 +187,6 @@ def numpy_generator(key: Array) -> np.random.Generator:
 LEVELS = (0.025, 0.1, 0.25, 0.5, 0.75, 0.9, 0.975)
 
 
-CACHED = 512
-"""Pixels that are summarized together: more do not fit into the cache."""
-
-
 class Marginals:
     """Marginals of a batch of pixels, filled in as answers come: NaN where a pixel has none.
 
@@ -219,8 +215,9 @@ class Marginals:
         self, at: np.ndarray, parameters: Mapping[str, AnyArray], weights: np.ndarray
     ) -> None:
         """Summarize the weighted draws of some pixels."""
-        for begin in range(0, at.size, CACHED):
-            some = slice(begin, begin + CACHED)
+        together = 512  # pixels: more do not fit into the cache
+        for begin in range(0, at.size, together):
+            some = slice(begin, begin + together)
             own = {name: np.asarray(x)[some] for name, x in parameters.items()}
             self._describe(at[some], own, weights[some])
 

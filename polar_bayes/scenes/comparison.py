@@ -50,7 +50,7 @@ from polar_bayes.scenes.library import (
     named_setup,
     scene_library,
 )
-from polar_bayes.scenes.sentences import ERRORS_APART, SMALL_DIFFERENCE, SceneComparison
+from polar_bayes.scenes.sentences import SceneComparison, is_apart
 
 METHOD = Importance(draws=2048, rounds=12)
 """Of the fits that are compared. Most take few rounds; posteriors that are curved in many
@@ -374,7 +374,7 @@ def _is_worse(fits: _Fits, best: Choice, choice: Choice) -> bool:
     if not {name_of(best), name_of(choice)} <= fits.done.keys():
         return False
     gain, error = _gain(fits.done[name_of(choice)], fits.done[name_of(best)])
-    return gain < -max(SMALL_DIFFERENCE, ERRORS_APART * error)
+    return is_apart(-gain, error)
 
 
 def _gain(one: _Fit, other: _Fit) -> tuple[float, float]:
@@ -444,7 +444,7 @@ def _predictions(fits: Mapping[str, _Fit]) -> pd.DataFrame:
 
 def _remaining(fits: Mapping[str, _Fit], table: pd.DataFrame) -> list[str]:
     """Scenes that are not told apart from the best, and that their priors allow if any are."""
-    apart = table["elpd_diff"].abs() > np.maximum(SMALL_DIFFERENCE, ERRORS_APART * table["dse"])
+    apart = is_apart(table["elpd_diff"].abs(), table["dse"])
     near = [str(name) for name in table.index[~apart]]
     allowed = [name for name in near if not fits[name].is_contradicted]
     return allowed or near

@@ -30,9 +30,6 @@ from polar_bayes.physics.subsurface import Depolarizer, Lambertian, Unpolarized
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 from polar_bayes.setups import SETUPS, Setup
 
-MIRROR_TOLERANCE = 0.5
-"""Largest difference of a view from the mirror direction of the light, unit degree."""
-
 Choice = tuple[str, ...]
 """The option of each slot, by name; "" where the slot stays empty."""
 
@@ -237,7 +234,8 @@ def is_mirrored(capture: xr.Dataset) -> bool:
     zenith = np.abs(capture["view_zenith"] - capture["light_zenith"])
     around = np.abs((capture["view_azimuth"] - capture["light_azimuth"]) % 360.0 - 180.0)
     sideways = around * np.sin(np.radians(capture["view_zenith"]))
-    return bool((zenith <= MIRROR_TOLERANCE).all() and (sideways <= MIRROR_TOLERANCE).all())
+    degree = 0.5  # from the mirror direction of the light, at most
+    return bool((zenith <= degree).all() and (sideways <= degree).all())
 
 
 def has_beam(capture: xr.Dataset) -> bool:

@@ -41,12 +41,6 @@ from polar_bayes.physics.variants import alternatives_of
 from polar_bayes.priors import resolve_priors
 from polar_bayes.progress import Progress
 
-JITTER = 1e-9
-"""Share by which variances are widened, so that rounding leaves a covariance positive definite."""
-
-PRIOR_DRAWS = 101
-"""Draws whose median is the start of a parameter that only the alternative has."""
-
 
 def compare_alternatives(
     request: Request,
@@ -124,10 +118,10 @@ def _with_scene(
     starts, covariance = np.zeros((len(heavy), program.size)), np.eye(program.size)
     starts[:, here] = heavy[:, there]
     covariance[np.ix_(here, here)] = symmetrize(modes.covariance[0])[np.ix_(there, there)]
-    covariance[np.diag_indices_from(covariance)] *= 1.0 + JITTER
+    covariance[np.diag_indices_from(covariance)] *= 1.0 + 1e-9  # positive definite after rounding
     # What only the other scene has starts at the median of its prior.
     for name in program.positions.keys() - known.keys():
-        median = jnp.median(priors[name].sample(key, (PRIOR_DRAWS,)), axis=0)
+        median = jnp.median(priors[name].sample(key, (101,)), axis=0)
         starts[:, program.positions[name]] = dist.biject_to(program.supports[name]).inv(median)
     potential = DifferencedPotential(program.evaluated, data, np.sqrt(np.diagonal(covariance)))
     return potential, starts, covariance

@@ -44,13 +44,6 @@ from polar_bayes.progress import Progress
 # --- Cost of a compiled program -------------------------------------------------------------------
 
 
-TIMED_ROUNDS = 40
-"""How often each program is timed."""
-
-CALLS = 3
-"""How many calls make one timing."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Compiled:
     """A compiled program, its operations, and the time of its compilation."""
@@ -70,19 +63,21 @@ def compile_and_count(function: Callable, *arguments: object) -> Compiled:
     return Compiled(program, float(operations), seconds)
 
 
-def run_seconds(calls: Sequence[Callable[[], object]]) -> list[float]:
+def run_seconds(
+    calls: Sequence[Callable[[], object]], *, rounds: int = 40, repeats: int = 3
+) -> list[float]:
     """Time of each call at its fastest, results awaited."""
 
     # The calls take turns, so that a machine that slows down slows them all alike; the fastest
     # round is the one that other programs disturbed least.
     def seconds(call: Callable[[], object]) -> float:
         begin = time.perf_counter()
-        for _ in range(CALLS):
+        for _ in range(repeats):
             jax.block_until_ready(call())
-        return (time.perf_counter() - begin) / CALLS
+        return (time.perf_counter() - begin) / repeats
 
-    rounds = [[seconds(call) for call in calls] for _ in range(TIMED_ROUNDS)]
-    return [float(fastest) for fastest in np.min(rounds, axis=0)]
+    found = [[seconds(call) for call in calls] for _ in range(rounds)]
+    return [float(fastest) for fastest in np.min(found, axis=0)]
 
 
 # --- The log posterior density of one scene -------------------------------------------------------
@@ -164,17 +159,8 @@ def compile_density(request: Request, data: Observations) -> SceneDensity:
 # --- Laplace approximations of two scenes ---------------------------------------------------------
 
 
-STARTS = 6
-"""Prior draws from which the mode of the full scene is sought."""
-
 FIRST_STEP, STEP = 1e-5, 1e-3
 """Steps of differences: before the width of the posterior is known, and in units of it."""
-
-SEARCHES = 2
-"""Searches for one mode; the second knows the width that the first has found."""
-
-NEW_WIDTH = 0.1
-"""A first guess at the width of a parameter that only the simpler scene has."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -195,7 +181,7 @@ class LaplaceFit:
 def fit_laplace(density: SceneDensity, key: Array, progress: Progress) -> LaplaceFit:
     """The heaviest mode of a posterior, from prior draws."""
     size = density.program.size
-    starts = from_prior(density.program, key, STARTS, density.data)
+    starts = from_prior(density.program, key, 6, density.data)
     potential = _scaled_potential(density, np.zeros(size), np.eye(size), FIRST_STEP)
     modes = find_modes(potential, starts, progress)
     return _refine(density, modes.z[0], modes.covariance[0])
@@ -203,7 +189,7 @@ def fit_laplace(density: SceneDensity, key: Array, progress: Progress) -> Laplac
 
 def _refine(density: SceneDensity, z: np.ndarray, covariance: np.ndarray) -> LaplaceFit:
     """Search the mode in coordinates in which the posterior is about standard normal."""
-    for _ in range(SEARCHES):
+    for _ in range(2):  # the second search knows the width that the first has found
         factor = np.linalg.cholesky(covariance)
         potential = _scaled_potential(density, z, factor, STEP)
         end = find_mode(potential, np.zeros(z.size))
@@ -272,7 +258,8 @@ class Baseline:
         _, ours, theirs = np.intersect1d(fit.density.labels, other.labels, return_indices=True)
         start = np.zeros(len(other.labels))
         start[theirs] = fit.z[ours]
-        covariance = np.diag(np.full(start.size, NEW_WIDTH**2))
+        # A first guess at the width of a parameter that only the simpler scene has.
+        covariance = np.diag(np.full(start.size, 0.1**2))
         covariance[np.ix_(theirs, theirs)] = fit.covariance[np.ix_(ours, ours)]
         moves = self._moves(other, start)
         found = _refine(other, start, covariance)

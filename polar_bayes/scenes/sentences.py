@@ -14,14 +14,10 @@ from polar_bayes.inference.request import Request
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import describe_prior
 
-SMALL_DIFFERENCE = 4.0
-"""Difference in elpd, unit nat, below which two scenes are not told apart, whatever its error."""
 
-ERRORS_APART = 2.0
-"""Standard errors of the difference beyond which a scene is told apart from the best."""
-
-MUCH_BETWEEN = 0.1
-"""Share of the variance of a parameter between scenes that is stated."""
+def is_apart[T: (float, pd.Series)](difference: T, error: T) -> T:
+    """Whether a difference in elpd (nat) tells scenes apart: beyond 2 standard errors, and 4."""
+    return (difference > 4.0) & (difference > 2.0 * error)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -169,7 +165,7 @@ def _why_not(scene: xr.Dataset) -> str:
     """Why a scene does not remain."""
     name, difference = str(scene["scene"].item()), abs(float(scene["elpd_diff"]))
     error = float(scene["dse"])
-    if difference > max(SMALL_DIFFERENCE, ERRORS_APART * error):
+    if is_apart(difference, error):
         return f"Not {name}: it predicts worse, by {difference:.1f} ± {error:.1f} nat in all."
     if "priors" in str(scene["criticism"].item()):
         return f"Not {name}: its parameters are where their priors hardly allow them."
@@ -193,7 +189,7 @@ def _escaped(found: xr.Dataset, chosen: str) -> Iterator[str]:
 def _between(found: xr.Dataset) -> list[str]:
     """What share of the width of each interval is between scenes."""
     share = found["between_share"].to_series().dropna()
-    much = share[share >= MUCH_BETWEEN]
+    much = share[share >= 0.1]  # of its variance
     if much.empty:
         return ["The remaining scenes agree: hardly any of the width is between them."]
     listed = ", ".join(f"{name} {value:.0%}" for name, value in much.items())
