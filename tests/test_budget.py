@@ -9,33 +9,33 @@ from cases import each
 ROOT = Path(__file__).parents[1]
 
 CODE = {
-    "benchmark": 591,
-    "calibration": 1123,
-    "capture": 823,
-    "cli": 1117,
-    "design": 1169,
-    "diagnostics": 1706,
-    "importers": 1212,
-    "inference": 2827,
-    "maps": 1791,
-    "methods": 1218,
-    "numerics": 660,
-    "observation": 506,
-    "physics": 2529,
-    "reporting": 3066,
-    "scenes": 1646,
-    "own files": 1539,
-    "models": 381,
-    "tests": 24030,
+    "benchmark": 588,
+    "calibration": 1068,
+    "capture": 783,
+    "cli": 1124,
+    "design": 1066,
+    "diagnostics": 1689,
+    "importers": 1159,
+    "inference": 2713,
+    "maps": 1734,
+    "methods": 1229,
+    "numerics": 815,
+    "observation": 472,
+    "physics": 2383,
+    "reporting": 2986,
+    "scenes": 1665,
+    "own files": 1481,
+    "models": 318,
+    "tests": 22572,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 23903,
+    "code": 23273,
     "classes": 332,
-    "constants": 620,
-    "Any": 360,
-    "longest function": 126,
+    "constants": 414,
+    "Any": 168,
+    "longest function": 116,
 }
 """Of the package, at most so many; of `longest function` the lines."""
 
