@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import scipy.linalg
@@ -103,7 +102,7 @@ def _identify_at(problem: DesignProblem, mode: np.ndarray) -> xr.Dataset:
         )
 
     information, prior, paper, exact, jacobian, values = (
-        np.asarray(x) for x in evaluate(jnp.asarray(mode), problem.data)
+        np.asarray(x) for x in evaluate(mode, problem.data)
     )
     prior = positive_definite(prior, problem.prior)
     jacobian = jacobian[labels.rows]

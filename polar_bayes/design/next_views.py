@@ -230,9 +230,10 @@ def _extended(
     scene = problem.request.scene
     request = resolve(views.capture, model, scene, priors, links, limit, seed, "double")
     data = observe_request(request)
-    recorded = jnp.broadcast_to(problem.data.brightness, problem.data.shape)
-    rest = jnp.full((*data.shape[:-1], data.shape[-1] - views.measured), jnp.median(recorded))
-    data = dataclasses.replace(data, brightness=jnp.concatenate([recorded, rest], axis=-1))
+    recorded = np.broadcast_to(problem.data.brightness, problem.data.shape)
+    rest = np.full((*data.shape[:-1], data.shape[-1] - views.measured), np.median(recorded))
+    brightness = jax.device_put(np.concatenate([recorded, rest], axis=-1))
+    data = dataclasses.replace(data, brightness=brightness)
     compiled_model = compile_model(request, data)
     data, program, prior = compiled_model.free(data), compiled_model.program, problem.prior
     for name in (name for name in new if name not in program.observed):
@@ -273,7 +274,7 @@ def _design(
         return information_by_view(reading_information(program, z, data), axes), jacobian
 
     run = compiled(lambda z, data: jax.lax.map(lambda one: evaluate(one, data), z))
-    information, jacobian = jax.tree.map(np.asarray, run(jnp.asarray(z), data))
+    information, jacobian = jax.tree.map(np.asarray, run(z, data))
     hessian = compiled(lambda z, data: prior_precision(program, z, data))(center, data)
     size, many = program.size, data.shape[-1]
     by_view = {n: x.reshape(count, -1, many, size, size) for n, x in information.items()}

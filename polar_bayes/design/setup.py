@@ -1,11 +1,11 @@
 """Set-up of a design problem: model, capture, posterior modes, and the labels of coordinates."""
 
 import json
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from jax.flatten_util import ravel_pytree
@@ -17,7 +17,7 @@ from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.initialization import STARTS
 from polar_bayes.inference.problem import compile_request
-from polar_bayes.inference.program import Program, from_prior
+from polar_bayes.inference.program import Program, from_prior, places
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.numerics.compile import compiled
@@ -96,9 +96,9 @@ class ParameterLabels(NamedTuple):
 def label_parameters(problem: DesignProblem) -> ParameterLabels:
     """Label every scalar parameter of a model, with its draws from the prior."""
     program, capture = problem.program, problem.request.capture
-    draws = program.parameters_of_chains(jnp.asarray(problem.prior[None]), problem.data)
-    flat, unravel = ravel_pytree({name: x[:1, :1] for name, x in draws.items()})
-    positions = label_scalars(program, capture, unravel(jnp.arange(flat.size, dtype=flat.dtype)))
+    draws = program.parameters_of_chains(problem.prior[None], problem.data)
+    numbers = places({name: x.shape[2:] for name, x in draws.items()})
+    positions = label_scalars(program, capture, {n: x[None, None] for n, x in numbers.items()})
     rows = [int(scalar.draws.item()) for scalar in positions]
     return ParameterLabels(label_scalars(program, capture, draws), rows)
 
@@ -125,17 +125,21 @@ def _fit_draws(
     """Finite draws of a fit, evenly spaced, as unconstrained vectors."""
     where, program = "next_views: result", problem.program
     check_fit(result, where)
-    template = program.constrain(jnp.zeros(program.size))
+    template = program.latent_shapes
     groups = [result.get(name) for name in ("posterior", "unconstrained_posterior")]
     sites = {}
     for name in program.supports:
         group = next((g for g in groups if g is not None and name in g.data_vars), None)
-        if group is None or group[name].size % template[name].size or group[name].ndim < 2:
+        if (
+            group is None
+            or group[name].size % math.prod(template[name].shape)
+            or group[name].ndim < 2
+        ):
             hint = "give a fit of the same capture, model, scene and links"
             what = f"it has no draws of {name} as this model has it"
             raise FitError(what, where=where, hint=hint)
         values = group[name].transpose("chain", "draw", ...).to_numpy()
-        sites[name] = values.reshape(-1, *template[name].shape)
+        sites[name] = values.reshape(-1, *shape)
     number = min(len(x) for x in sites.values())
     finite = [np.isfinite(x.reshape(number, -1)).all(axis=1) for x in sites.values()]
     usable = np.flatnonzero(np.all(finite, axis=0))
@@ -149,7 +153,7 @@ def unconstrain(
     program: Program, values: Mapping[str, Float[np.ndarray, "draw ..."]]
 ) -> Float[np.ndarray, "draw size"]:
     """Draws of all latent sites as unconstrained vectors."""
-    sites = {name: jnp.asarray(values[name]) for name in program.supports}
+    sites = {name: values[name] for name in program.supports}
     return np.asarray(compiled(jax.vmap(program.unconstrain))(sites))
 
 

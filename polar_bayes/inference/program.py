@@ -97,11 +97,8 @@ class Program:
     @functools.cached_property
     def positions(self) -> dict[str, np.ndarray]:
         """Indices of the unconstrained coordinates, by site."""
-        found, begin = {}, 0
-        for name, like in jax.eval_shape(self.unravel, self._vector).items():
-            end = begin + math.prod(like.shape)
-            found[name], begin = np.arange(begin, end).reshape(like.shape), end
-        return found
+        sites = jax.eval_shape(self.unravel, self._vector)
+        return places({name: like.shape for name, like in sites.items()})
 
     @property
     def _vector(self) -> jax.ShapeDtypeStruct:
@@ -145,11 +142,11 @@ class Program:
     def free(self, data: Observations) -> Observations:
         """The data with room for what is held, and nothing held; programs are those of `hold`."""
         dtype = data.brightness.dtype
-        held = {n: np.full(x.shape, np.nan, dtype) for n, x in self._latent_shapes.items()}
+        held = {n: np.full(x.shape, np.nan, dtype) for n, x in self.latent_shapes.items()}
         return dataclasses.replace(data, held=jax.device_put(held))
 
     @functools.cached_property
-    def _latent_shapes(self) -> dict[str, jax.ShapeDtypeStruct]:
+    def latent_shapes(self) -> dict[str, jax.ShapeDtypeStruct]:
         """Of the latent sites in their supports."""
         return jax.eval_shape(self.constrain, self._vector)
 
@@ -372,6 +369,15 @@ def compile_program(model: Model, data: Observations) -> Program:
         size=flat.size,
         unravel=unravel,
     )
+
+
+def places(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
+    """By name, the indices of arrays of these shapes in the vector that `ravel_pytree` makes."""
+    found, begin = {}, 0
+    for name in sorted(shapes):
+        end = begin + math.prod(shapes[name])
+        found[name], begin = np.arange(begin, end).reshape(shapes[name]), end
+    return found
 
 
 def is_auxiliary(site: Site) -> bool:
