@@ -130,11 +130,8 @@ def _fit_draws(
     sites = {}
     for name in program.supports:
         group = next((g for g in groups if g is not None and name in g.data_vars), None)
-        if (
-            group is None
-            or group[name].size % math.prod(template[name].shape)
-            or group[name].ndim < 2
-        ):
+        shape = template[name].shape
+        if group is None or group[name].size % math.prod(shape) or group[name].ndim < 2:
             hint = "give a fit of the same capture, model, scene and links"
             what = f"it has no draws of {name} as this model has it"
             raise FitError(what, where=where, hint=hint)
