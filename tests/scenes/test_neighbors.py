@@ -138,7 +138,7 @@ def test_a_body_that_is_not_there_has_no_alternative() -> None:
         "plastic",
         scene=own.scene,
         links=own.links,
-        protocol=Protocol(views=16, wavelengths=()),
+        protocol=Protocol(views=40, wavelengths=()),
         parameters={"subsurface_fraction": 0.0},
         seed=14,
     )
