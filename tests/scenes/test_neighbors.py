@@ -1,6 +1,7 @@
 """Alternative parts: Bayes factors and answers in closed form, and worlds with another part."""
 
 import dataclasses
+from collections.abc import Iterator
 
 import linear
 import numpy as np
@@ -8,6 +9,7 @@ import numpyro
 import pytest
 import toy_models
 import xarray as xr
+from compilations import compiled_fast
 from numpyro import distributions as dist
 from scipy import stats
 
@@ -38,6 +40,13 @@ def _exact(q: np.ndarray, slope: float) -> tuple[float, float, float]:
     covariance = linear.NOISE**2 * np.eye(q.size) + np.outer(x, x)
     evidence = float(stats.multivariate_normal(cov=covariance).logpdf(q))
     return evidence, variance * (x @ q) / linear.NOISE**2, variance**0.5
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick() -> Iterator[None]:
+    """The programs are many and each runs for a moment."""
+    with pytest.MonkeyPatch.context() as patch:
+        yield from compiled_fast(patch, starts=8, typical=50, draws=100, block=100)
 
 
 @pytest.fixture(scope="module")
