@@ -1,11 +1,8 @@
 """A small plate with two faults of its instrument, weighed once for all tests."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import xarray as xr
-from compilations import compiled_fast
 from plates import LINKS, plate_capture
 
 import polar_bayes as pb
@@ -18,13 +15,6 @@ PLATE = pb.Scene(
         (pb.instrument.AngleZero(), pb.instrument.BeamOverlap(), pb.instrument.Leakage())
     ),
 )
-
-
-@pytest.fixture(scope="module")
-def quick() -> Iterator[None]:
-    """The programs of a comparison are many and each runs for a moment."""
-    with pytest.MonkeyPatch.context() as patch:
-        yield from compiled_fast(patch, starts=8, typical=50, draws=100, block=100)
 
 
 @pytest.fixture(scope="package")

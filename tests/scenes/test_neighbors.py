@@ -1,6 +1,7 @@
 """Alternative parts: Bayes factors and answers in closed form, and worlds with another part."""
 
 import dataclasses
+from collections.abc import Iterator
 
 import linear
 import numpy as np
@@ -8,6 +9,7 @@ import numpyro
 import pytest
 import toy_models
 import xarray as xr
+from compilations import compiled_fast
 from numpyro import distributions as dist
 from scipy import stats
 
@@ -20,7 +22,12 @@ ROUGH = pb.Scene(pb.RoughSurface(pb.Beckmann(), pb.PointSource()))
 SLOPE = {pb.Beckmann: 1.0, pb.GGX: 1.3}
 DRAWS = 4000
 
-pytestmark = pytest.mark.usefixtures("quick")
+
+@pytest.fixture(scope="module", autouse=True)
+def quick() -> Iterator[None]:
+    """The programs of a comparison are many and each runs for a moment."""
+    with pytest.MonkeyPatch.context() as patch:
+        yield from compiled_fast(patch, starts=8, typical=50, draws=100, block=100)
 
 
 def _line(data, scene, priors, links):
@@ -43,7 +50,7 @@ def _exact(q: np.ndarray, slope: float) -> tuple[float, float, float]:
 
 
 @pytest.fixture(scope="module")
-def fitted_line(quick) -> xr.DataTree:
+def fitted_line() -> xr.DataTree:
     return pb.fit(
         toy_models.capture(),
         model=_line,
@@ -119,7 +126,7 @@ def test_a_distribution_that_explains_the_readings_better_is_a_problem() -> None
 
 
 @pytest.fixture(scope="module")
-def absorbing_body(quick) -> xr.DataTree:
+def absorbing_body() -> xr.DataTree:
     return _fit("leaf", "camera", subsurface=pb.physics.Depolarizer())
 
 
