@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from cases import each
+from compilations import compiled_fast
 from test_architecture import LAYERS
 
 import polar_bayes as pb
@@ -30,7 +31,6 @@ from polar_bayes.cli import commands
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
-from polar_bayes.scenes import fit_request as fitting
 from polar_bayes.scenes.fitting import fit
 
 ROOT = Path(__file__).parents[1]
@@ -99,6 +99,9 @@ def rehearse(capture: xr.Dataset, asked: dict[str, object]) -> None:
     assert jax.eval_shape(program.potential, np.zeros(program.size), data).shape == ()
 
 
+quickly = contextlib.contextmanager(compiled_fast)
+
+
 @pytest.fixture(scope="module")
 def fits() -> Fits:
     return Fits()
@@ -128,11 +131,10 @@ def test_the_python_of_a_page_runs(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(pb, "fit", fits)
-    monkeypatch.setattr(fitting, "PRIOR_DRAWS", 100)
-    monkeypatch.setattr("polar_bayes.inference.program.BLOCK", 100)
     namespace: dict[str, object] = {"__name__": page.stem}
-    for line, code in blocks(page, "python"):
-        exec(compile("\n" * line + code, str(page), "exec"), namespace)
+    with quickly(monkeypatch, starts=4, typical=50, draws=100, block=100):
+        for line, code in blocks(page, "python"):
+            exec(compile("\n" * line + code, str(page), "exec"), namespace)
 
 
 # --- commands -------------------------------------------------------------------------------

@@ -37,55 +37,59 @@ def value_in_digits(z: float) -> mpmath.mpf:
         return high
 
 
-@each(
-    ("z", "dtype"),
-    [(z, dtype) for z in SCORES for dtype in (np.float64, np.float32) if abs(z) < REACH[dtype]],
-)
-def test_values_and_slopes_agree_with_fifty_digits(z: float, dtype: type) -> None:
-    """The error of a score is that of its rounding, z dz relative in its value."""
-    given = dtype(z)
+def in_digits(z: float) -> tuple[mpmath.mpf, mpmath.mpf]:
+    """The half-normal value of a score and its slope."""
     if z > -9.0:
-        exact = value_in_digits(float(given))
+        value = value_in_digits(z)
     else:  # the value is its tail probability, to all digits
-        exact = mpmath.sqrt(mpmath.pi / 2) * mpmath.ncdf(float(given))
-    slope = mpmath.exp((exact**2 - mpmath.mpf(float(given)) ** 2) / 2) / 2
-    allowed = 30.0 * float(np.finfo(dtype).eps) * max(1.0, z**2)
-    assert float(half_normal_of_score(jnp.asarray(given))) == pytest.approx(
-        float(exact), rel=allowed
-    )
-    assert float(jax.grad(half_normal_of_score)(jnp.asarray(given))) == pytest.approx(
-        float(slope), rel=allowed
-    )
+        value = mpmath.sqrt(mpmath.pi / 2) * mpmath.ncdf(z)
+    return value, mpmath.exp((value**2 - mpmath.mpf(z) ** 2) / 2) / 2
 
 
 @each("dtype", [np.float64, np.float32])
-@each("z", [*SCORES, *FAR])
-def test_what_is_far_out_is_finite_and_comes_back(z: float, dtype: type) -> None:
-    """Value, gradient and Hessian of the density of a score; where the value is not yet zero."""
+def test_values_and_slopes_agree_with_fifty_digits(dtype: type) -> None:
+    """The error of a score is that of its rounding, z dz relative in its value."""
+    scores = np.asarray([z for z in SCORES if abs(z) < REACH[dtype]], dtype)
+    value_and_slope = jax.jit(jax.vmap(jax.value_and_grad(half_normal_of_score)))
+    for z, *found in zip(map(float, scores), *value_and_slope(scores), strict=True):
+        allowed = 30.0 * float(np.finfo(dtype).eps) * max(1.0, z**2)
+        for ours, exact in zip(map(float, found), map(float, in_digits(z)), strict=True):
+            assert ours == pytest.approx(exact, rel=allowed), z
+
+
+def score_density(z: jax.Array) -> jax.Array:
+    """Log density of the score of a half-normal value."""
     move = biject_to(HalfNormal(SCALE).support)
+    value = move(z)  # may be zero, of which NumPyro's own density warns
+    own = 0.5 * jnp.log(2.0 / jnp.pi) - jnp.log(SCALE) - 0.5 * (value / SCALE) ** 2
+    return own + move.log_abs_det_jacobian(z, value)
 
-    def log_density(z: jax.Array) -> jax.Array:
-        value = move(z)  # may be zero, of which NumPyro's own density warns
-        own = 0.5 * jnp.log(2.0 / jnp.pi) - jnp.log(SCALE) - 0.5 * (value / SCALE) ** 2
-        return own + move.log_abs_det_jacobian(z, value)
 
-    at = jnp.asarray(z, dtype)
-    normal = -0.5 * np.log(2.0 * np.pi) - 0.5 * float(at) ** 2
-    rounding = 40.0 * float(np.finfo(dtype).eps) * (1.0 + z**2)
-    assert float(log_density(at)) == pytest.approx(normal, abs=rounding)
-    assert np.isfinite([jax.grad(log_density)(at), jax.grad(jax.grad(log_density))(at)]).all()
-    value = half_normal_of_score(at)
-    if value > np.finfo(dtype).tiny:
-        assert float(score_of_half_normal(value)) == pytest.approx(
-            z, abs=40.0 * rounding / (1.0 + abs(z))
-        )
+@each("dtype", [np.float64, np.float32])
+def test_what_is_far_out_is_finite_and_comes_back(dtype: type) -> None:
+    """Value, gradient and Hessian of the density of a score; where the value is not yet zero."""
+    scores = np.asarray([*SCORES, *FAR], dtype)
+
+    def everything(z: jax.Array) -> tuple[jax.Array, ...]:
+        slope, value = jax.grad(score_density), half_normal_of_score(z)
+        return score_density(z), slope(z), jax.grad(slope)(z), value, score_of_half_normal(value)
+
+    found = np.asarray(jax.jit(jax.vmap(everything))(scores))
+    assert np.isfinite(found[:3]).all()
+    for z, density, value, again in zip(map(float, scores), *found[[0, 3, 4]], strict=True):
+        rounding = 40.0 * float(np.finfo(dtype).eps) * (1.0 + z**2)
+        assert density == pytest.approx(-0.5 * np.log(2.0 * np.pi) - 0.5 * z**2, abs=rounding), z
+        if value > np.finfo(dtype).tiny:
+            assert again == pytest.approx(z, abs=40.0 * rounding / (1.0 + abs(z))), z
 
 
 @each("prior", [HalfNormal(SCALE), Beta(1.0, 3.0), Beta(10.0, 1.0), Beta(1.0, 1.0)])
 def test_scores_of_draws_are_standard_normal(prior: dist.Distribution) -> None:
     """Mean, variance and every tenth of 20,000, within 4 standard errors."""
-    drawn = prior.sample(jax.random.key(3), (20_000,))
-    scores = np.asarray(biject_to(prior.support).inv(drawn))
+    inverse = biject_to(prior.support).inv
+    scores = np.asarray(
+        jax.jit(lambda key: inverse(prior.sample(key, (20_000,))))(jax.random.key(3))
+    )
     assert abs(scores.mean()) < 4.0 / 20_000**0.5
     assert abs(scores.var() - 1.0) < 4.0 * (2.0 / 20_000) ** 0.5
     shares = np.arange(0.1, 0.95, 0.1)

@@ -7,41 +7,22 @@ from cases import each
 
 import polar_bayes as pb
 from polar_bayes.errors import SceneError
-from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import SCENES, Scene
 from polar_bayes.setups import SETUPS, Setup, find_setup
 
-EVERY_SETUP = each("name", SETUPS)
 
-
-@EVERY_SETUP
-def test_a_setup_is_found_by_its_name(name):
+@each("name", SETUPS)
+def test_a_setup_hangs_together(name):
+    """Its scene has a name, material parameters come first, a link is of a polarization."""
     setup = find_setup(name)
     assert setup is SETUPS[name]
-    assert isinstance(setup, Setup)
     assert setup.scene == SCENES[name]
-
-
-@EVERY_SETUP
-def test_every_link_describes_its_variable_and_one_of_them_a_polarization(name):
-    links = SETUPS[name].links
-    for variable, link in links.items():
-        assert isinstance(link, AbstractLink)
-        assert variable in link.observables
-    assert {"dop", "q", "u"} & set(links)
-
-
-@EVERY_SETUP
-def test_material_parameters_come_first_and_none_twice(name):
-    scene = SETUPS[name].scene
-    assert isinstance(scene, Scene)
-    assert len(set(scene.parameters)) == len(scene.parameters)
-    assert "refractive_index" in scene.parameters
-
-
-@EVERY_SETUP
-def test_the_limit_of_the_view_zenith_is_an_angle(name):
-    assert 0.0 < SETUPS[name].largest_view_zenith <= 90.0
+    parameters = setup.scene.parameters
+    assert len(set(parameters)) == len(parameters)
+    assert "refractive_index" in parameters
+    assert all(variable in link.observables for variable, link in setup.links.items())
+    assert {"dop", "q", "u"} & set(setup.links)
+    assert 0.0 < setup.largest_view_zenith <= 90.0
 
 
 def test_every_named_scene_has_a_setup():

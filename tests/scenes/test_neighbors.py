@@ -1,6 +1,7 @@
 """Alternative parts: Bayes factors and answers in closed form, and worlds with another part."""
 
 import dataclasses
+from collections.abc import Iterator
 
 import linear
 import numpy as np
@@ -8,6 +9,7 @@ import numpyro
 import pytest
 import toy_models
 import xarray as xr
+from compilations import compiled_fast
 from numpyro import distributions as dist
 from scipy import stats
 
@@ -19,6 +21,13 @@ from polar_bayes.simulation import Protocol
 ROUGH = pb.Scene(pb.RoughSurface(pb.Beckmann(), pb.PointSource()))
 SLOPE = {pb.Beckmann: 1.0, pb.GGX: 1.3}
 DRAWS = 4000
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick() -> Iterator[None]:
+    """The programs of a comparison are many and each runs for a moment."""
+    with pytest.MonkeyPatch.context() as patch:
+        yield from compiled_fast(patch, starts=8, typical=50, draws=100, block=100)
 
 
 def _line(data, scene, priors, links):
@@ -91,8 +100,8 @@ def test_a_point_fit_has_nothing_to_compare() -> None:
         alternatives(fit)
 
 
-def _fit(preset: str, setup: str, **parts) -> xr.DataTree:
-    """A fit by a set-up of forty readings of a world with other parts."""
+def _fit(preset: str, setup: str, seed: int = 0, parameters=None, **parts) -> xr.DataTree:
+    """A fit by a set-up of forty readings of a world with other parts or known parameters."""
     own = pb.setups.SETUPS[setup]
     if "distribution" in parts:
         parts = {"surface": dataclasses.replace(own.scene.surface, **parts)}
@@ -101,9 +110,10 @@ def _fit(preset: str, setup: str, **parts) -> xr.DataTree:
         scene=dataclasses.replace(own.scene, **parts),
         links=own.links,
         protocol=Protocol(views=40, wavelengths=()),
-        seed=0,
+        parameters=parameters,
+        seed=seed,
     )
-    return pb.fit(capture, scene=setup, method="laplace", seed=0)
+    return pb.fit(capture, scene=setup, method="laplace", seed=seed)
 
 
 @pytest.mark.thorough
@@ -133,16 +143,7 @@ def test_a_body_that_may_absorb_is_told_with_the_answer_it_gives(absorbing_body)
 
 def test_a_body_that_is_not_there_has_no_alternative() -> None:
     """Another body that sends nothing either is no better explanation, whatever its prior says."""
-    own = pb.setups.SETUPS["camera"]
-    capture = pb.simulate(
-        "plastic",
-        scene=own.scene,
-        links=own.links,
-        protocol=Protocol(views=40, wavelengths=()),
-        parameters={"subsurface_fraction": 0.0},
-        seed=14,
-    )
-    fit = pb.fit(capture, scene="camera", method="laplace", seed=14)
+    fit = _fit("plastic", "camera", seed=14, parameters={"subsurface_fraction": 0.0})
     row = criticize(fit).loc["alternatives"]
     assert row["level"] == "passed"
     assert "Depolarizer" in set(alternatives(fit)["alternative"])  # compared, and no news
