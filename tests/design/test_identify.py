@@ -178,8 +178,3 @@ def test_a_prior_that_bends_the_other_way_stays_a_precision() -> None:
     assert (np.linalg.eigvalsh(few) > 0.0).all()
     sound = np.array([[2.0, 1.0], [1.0, 2.0]])
     np.testing.assert_array_equal(positive_definite(sound, draws), sound)
-
-
-def test_something_else_is_refused() -> None:
-    with pytest.raises(pb.FitError, match="it holds no fit; give the tree"):
-        pb.summary(xr.Dataset())

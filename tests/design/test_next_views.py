@@ -164,8 +164,6 @@ def test_the_choice_is_said_in_words() -> None:
         "Look next at zenith 10, azimuth 180; then at zenith 80, azimuth 180."
     )
     assert list(pb.summary(found)) == ["now", "after 1", "after 2"]
-    with pytest.raises(pb.FitError, match="it holds no fit; give the tree"):
-        pb.summary(xr.Dataset())
 
 
 @each(

@@ -135,9 +135,15 @@ def test_maps_that_are_still_to_be_computed_are_computed_once(
 
 def test_what_does_not_fit_is_refused() -> None:
     maps = make_maps({"roughness": HALF})
-    with pytest.raises(pb.CaptureError, match="leaf: it knows the truth of no parameter"):
-        pb.diagnostics.map_coverage(maps, known(albedo=0.3))
-    with pytest.raises(pb.CaptureError, match="different axes \\(y 50 x x 40 and y 40 x x 50\\)"):
-        pb.diagnostics.map_coverage(maps, known(roughness=SPREAD.T))
-    with pytest.raises(pb.FitError, match="it holds no maps"):
-        pb.diagnostics.map_coverage(xr.Dataset(), known(roughness=0.5))
+    for given, truth, error, words in (
+        (maps, {"albedo": 0.3}, pb.CaptureError, "leaf: it knows the truth of no parameter"),
+        (
+            maps,
+            {"roughness": SPREAD.T},
+            pb.CaptureError,
+            r"different axes \(y 50 x x 40 and y 40 x x 50\)",
+        ),
+        (xr.Dataset(), {"roughness": 0.5}, pb.FitError, "it holds no maps"),
+    ):
+        with pytest.raises(error, match=words):
+            pb.diagnostics.map_coverage(given, known(**truth))

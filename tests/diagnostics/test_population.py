@@ -95,18 +95,14 @@ def test_estimates_alone_are_what_the_readings_say(spreads, rng) -> None:
 
 
 @pytest.mark.thorough
-def test_a_member_without_readings_says_nothing(rng) -> None:
+def test_a_member_without_readings_says_nothing_and_one_that_does_not_move_neither(rng) -> None:
+    assert np.isnan(unpooled_estimate(np.ones(9), np.zeros(9), np.ones(9))).all()
     no_progress = 1e6
     value, mu, spread = exact_draws(READINGS, np.append(ERRORS[:-1], no_progress), [0.06, 0.1], rng)
     unpooled = unpooled_estimate(value[-1], mu, spread)
     assert np.isnan(unpooled.mean)
     assert np.isnan(unpooled.sd)
     assert unpooled.shrinkage > 0.95
-
-
-@pytest.mark.thorough
-def test_a_member_that_does_not_move_has_no_estimate() -> None:
-    assert np.isnan(unpooled_estimate(np.ones(9), np.zeros(9), np.ones(9))).all()
 
 
 @each("name", LINKS)
@@ -195,9 +191,8 @@ def test_bounds_come_from_the_prior_of_the_location(said, bounds) -> None:
 )
 def test_what_a_spread_means_in_the_unit_of_the_parameter(name, expected) -> None:
     flat = np.zeros(CHAINS * DRAWS)
-    row = population_summary(tree(name, np.stack([flat, flat + 0.1]), flat + 0.2, flat + 0.1)).iloc[
-        0
-    ]
+    members = np.stack([flat, flat + 0.1])
+    row = population_summary(tree(name, members, flat + 0.2, flat + 0.1)).iloc[0]
     assert row["between"] == pytest.approx(expected)
     assert ("a factor of about 1.11" in row["meaning"]) == (name == "roughness")
 

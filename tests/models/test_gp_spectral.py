@@ -362,15 +362,11 @@ def test_what_is_no_spectral_model_is_refused(settings: dict, message: str) -> N
         pb.models.GpSpectral(**settings)
 
 
-def test_a_capture_without_colors_is_refused() -> None:
+def test_a_capture_without_colors_and_a_scene_without_the_spectrum_are_refused() -> None:
     with pytest.raises(pb.FitError, match="no axis wavelength to couple; fit it with model='per_m"):
         fit(THREE.isel(wavelength=0, drop=True))
-
-
-def test_a_scene_without_the_spectrum_is_refused() -> None:
-    model = pb.models.GpSpectral(coupled=("absorption",))
     with pytest.raises(pb.FitError, match="reads no absorption; couple one of refractive_index"):
-        fit(THREE, model)
+        fit(THREE, pb.models.GpSpectral(coupled=("absorption",)))
 
 
 @each("wavelengths", [[], [-500.0], [np.nan], [[500.0]], ["green"], None])

@@ -9,7 +9,6 @@ from arviz_stats.base import array_stats
 from cases import each
 from numpyro import distributions as dist
 from numpyro import handlers
-from patches import patch_capture
 from plates import LINKS, PLATE, plates
 from scipy import special, stats
 from textbook import plate_q
@@ -47,15 +46,11 @@ class LogitNormal:
         return stats.norm(self.center, self.spread).cdf(np.log(x / (1.0 - x)))
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "subsurface_fraction",
-        *(pytest.param(n, marks=pytest.mark.thorough) for n in ALL if n != "subsurface_fraction"),
-    ],
-)
+@each("name", ALL)
 def test_members_are_drawn_from_the_population(name: str) -> None:
-    capture = patch_capture(np.full(400, 1.45), views=2)
+    capture = plates(
+        np.full(400, 1.45), 0.1, np.array([40.0, 60.0])
+    )  # members are drawn before readings
     location, spread = {"refractive_index": (1.3, 0.2)}.get(name, (0.3, 0.6))
     near = {
         f"{name}_location": dist.TruncatedNormal(location, 1e-7, low=0.999 * location, high=1.999)
@@ -66,7 +61,7 @@ def test_members_are_drawn_from_the_population(name: str) -> None:
     if name == "refractive_index":
         near[f"{name}_location"] = pb.PRIORS[f"{name}_location"]
     model = pb.models.Hierarchical(pooled=(name,))
-    request = resolve(capture, model, None, near, None, None, 0, "double")
+    request = resolve(capture, model, "paper", near, LINKS, None, 0, "double")
     data = observe(request.capture)
     held = {f"{name}_location": np.float64(location)} if name == "refractive_index" else {}
     told = handlers.substitute(request.bind(request.scene), data=held)

@@ -116,14 +116,11 @@ def test_masked_entries_stand_inside_the_range_of_every_reading():
 
 
 def test_views_beyond_the_limit_are_set_aside_and_the_limit_itself_stays():
-    capture = make_capture(wavelength=True)
-    data = observe(capture, largest_view_zenith=60.0)
+    """Beside what the capture masks."""
+    data = observe(make_capture(wavelength=True), largest_view_zenith=60.0)
     np.testing.assert_array_equal(data.valid, np.broadcast_to(ZENITHS <= 60.0, (3, 4)))
-
-
-def test_the_mask_of_the_capture_and_the_limit_add_up():
-    data = observe(make_capture(valid=[False, True, True, True]), largest_view_zenith=70.0)
-    np.testing.assert_array_equal(data.valid, [False, True, True, False])
+    masked = observe(make_capture(valid=[False, True, True, True]), largest_view_zenith=70.0)
+    np.testing.assert_array_equal(masked.valid, [False, True, True, False])
 
 
 # --- the unit of intensity ------------------------------------------------------------------------
@@ -131,8 +128,9 @@ def test_the_mask_of_the_capture_and_the_limit_add_up():
 INTENSITY = np.array([8.0, 10.0, 20.0, 40.0])
 
 
-def test_without_a_level_the_largest_reading_is_the_unit():
-    data = observe(make_capture(intensity=INTENSITY))
+def test_without_a_level_the_largest_reading_is_the_unit_of_readings_and_errors():
+    data = observe(make_capture(intensity=INTENSITY, intensity_error=np.full(4, 2.0)))
+    np.testing.assert_array_equal(data.errors["intensity"], np.full(4, 0.05))
     np.testing.assert_array_equal(data.readings["intensity"], INTENSITY / 40.0)
     np.testing.assert_array_equal(data.brightness, INTENSITY / 40.0)
     assert float(data.intensity_unit) == 40.0
@@ -146,12 +144,6 @@ def test_a_stated_level_is_the_unit_and_the_full_scale():
     np.testing.assert_array_equal(data.brightness, INTENSITY / 80.0)
     assert float(data.intensity_unit) == 80.0
     assert float(data.full_scale) == 1.0
-
-
-@pytest.mark.thorough
-def test_errors_of_the_intensity_come_in_its_unit():
-    data = observe(make_capture(intensity=INTENSITY, intensity_error=np.full(4, 2.0)))
-    np.testing.assert_array_equal(data.errors["intensity"], np.full(4, 0.05))
 
 
 @pytest.mark.thorough
@@ -178,16 +170,10 @@ def test_a_masked_spike_dims_no_other_view():
 
 
 @pytest.mark.thorough
-def test_a_capture_without_light_stays_finite():
-    data = observe(make_capture(intensity=np.zeros(4)))
-    np.testing.assert_array_equal(data.brightness, np.zeros(4))
-    assert float(data.intensity_unit) == 1.0
-
-
-@pytest.mark.thorough
-def test_a_capture_without_intensity_counts_every_view_as_bright():
-    data = observe(make_capture(intensity=None, intensity_error=None))
-    np.testing.assert_array_equal(data.brightness, np.ones(4))
+@each(("intensity", "brightness"), [(np.zeros(4), 0.0), (None, 1.0)], ids=["dark", "unknown"])
+def test_without_light_views_are_dark_and_without_intensity_bright(intensity, brightness):
+    data = observe(make_capture(intensity=intensity, intensity_error=None))
+    np.testing.assert_array_equal(data.brightness, np.full(4, brightness))
     assert float(data.intensity_unit) == 1.0
     assert float(data.full_scale) == np.inf
 
