@@ -13,10 +13,10 @@ CODE = {
     "calibration": 1068,
     "capture": 783,
     "cli": 1124,
-    "design": 1066,
+    "design": 1068,
     "diagnostics": 1689,
     "importers": 1159,
-    "inference": 2713,
+    "inference": 2716,
     "maps": 1734,
     "methods": 1229,
     "numerics": 815,
@@ -26,12 +26,12 @@ CODE = {
     "scenes": 1665,
     "own files": 1481,
     "models": 318,
-    "tests": 22572,
+    "tests": 22506,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 23273,
+    "code": 23278,
     "classes": 332,
     "constants": 414,
     "Any": 168,

@@ -1,8 +1,8 @@
 """What a reader may paste works: Python runs, commands parse, names, links and messages exist.
 
 The first fit is done in full, by the method that compiles fastest, and so is every fit that states
-its own small settings. The others are checked as far as the trace of their posterior density and give back
-the latest result: each would compile programs of its own.
+its own small settings. The others are checked as far as the trace of their posterior density and
+give back the latest result: each would compile programs of its own.
 """
 
 import ast
