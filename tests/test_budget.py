@@ -26,7 +26,7 @@ CODE = {
     "scenes": 1665,
     "own files": 1481,
     "models": 318,
-    "tests": 22506,
+    "tests": 22552,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 

@@ -99,7 +99,7 @@ class SceneDensity:
 
     def evaluate(self, z: np.ndarray) -> tuple[Array, dict[str, Array]]:
         """The potential and the noise-free readings at an unconstrained vector."""
-        return self.compiled.call(jnp.asarray(z), self.data)
+        return self.compiled.call(np.asarray(z), self.data)
 
     def potential(self, z: np.ndarray) -> float:
         """Minus the log density of an unconstrained vector (size,), up to a constant."""
@@ -117,7 +117,7 @@ class SceneDensity:
                 trace = self.program.trace(z, data)
                 return {name: function(trace[name]["fn"]) for name in names}
 
-            found = jax.jit(of_noise)(jnp.asarray(z), self.data)
+            found = jax.jit(of_noise)(np.asarray(z), self.data)
             return {name: np.asarray(values) for name, values in found.items()}
 
         stated = apply(_stated_sd, self.program.observed)
@@ -150,7 +150,7 @@ def compile_density(request: Request, data: Observations) -> SceneDensity:
         predicted = {name: noise_free(trace, name) for name in program.observed}
         return -sum(terms.values(), jnp.zeros((), z.dtype)), predicted
 
-    compiled = compile_and_count(evaluate, jnp.zeros(program.size), data)
+    compiled = compile_and_count(evaluate, np.zeros(program.size), data)
     coordinates = label_coordinates(program, request.capture)
     labels, sites = (tuple(getattr(c, name) for c in coordinates) for name in ("label", "site"))
     return SceneDensity(program, data, compiled, labels, sites)

@@ -2,6 +2,9 @@
 
 import dataclasses
 import importlib
+import json
+import os
+import subprocess
 import sys
 import threading
 import warnings
@@ -341,3 +344,55 @@ def test_fits_side_by_side_leave_warnings_as_they_were() -> None:
     thread.join()
     assert heard == []
     assert list(warnings.filters) == before
+
+
+MOST_PROGRAMS = {
+    "simulate": 1,
+    "fit": 12,
+    "fit again": 0,
+    "next views": 6,
+    "identify": 2,
+    "choose effects": 11,
+    "report": 0,
+}
+"""That a verb compiles in a new process, after those above it; of effects, 9 are of its scenes."""
+
+COUNTING = """
+import json, sys
+import jax
+jax.config.update("jax_disable_most_optimizations", True)
+import polar_bayes as pb
+count = []
+def listen(event, seconds, **_):
+    if event == "/jax/core/compile/backend_compile_duration":
+        count.append(event)
+jax.monitoring.register_event_duration_secs_listener(listen)
+found = {}
+def counted(verb, call):
+    count.clear()
+    result = call()
+    found[verb] = len(count)
+    return result
+capture = counted("simulate", lambda: pb.simulate("plastic", seed=0))
+nuts = pb.methods.Nuts(warmup=50, draws=50, most_draws=50, block=50)
+result = counted("fit", lambda: pb.fit(capture, method=nuts))
+counted("fit again", lambda: pb.fit(pb.simulate("plastic", seed=1), method=nuts))
+counted("next views", lambda: pb.next_views(result))
+counted("identify", lambda: pb.identify(capture))
+counted("choose effects", lambda: pb.choose_effects(capture))
+counted("report", lambda: pb.report(result, sys.argv[1]))
+print(json.dumps(found))
+"""
+
+
+@pytest.mark.thorough
+def test_a_verb_compiles_few_programs(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", COUNTING, str(tmp_path / "report")],
+        env=os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert found == MOST_PROGRAMS
