@@ -1,13 +1,12 @@
 """One capture and one scene in, an ArviZ DataTree out."""
 
-import contextlib
 import dataclasses
 import inspect
 import json
 import math
 import platform
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from types import FunctionType
 
@@ -26,23 +25,17 @@ from polar_bayes.inference.prior_probability import has_probabilities, probabili
 from polar_bayes.inference.problem import Problem, make_problem
 from polar_bayes.inference.program import BLOCK, THREADS, Values, from_prior
 from polar_bayes.inference.request import Request
-from polar_bayes.inference.result import Provenance, assemble, posterior_of
+from polar_bayes.inference.result import Provenance, assemble
 from polar_bayes.methods.method import AbstractMethod, find_method
-from polar_bayes.numerics.compile import OutOfTimeError, check_memory, compiled, run_until
-from polar_bayes.numerics.mcse import SMALLEST_ESS
-from polar_bayes.physics.instrument import AbstractInstrumentTerm, Discrepancy
-from polar_bayes.physics.scene import Scene
+from polar_bayes.numerics.compile import check_memory, compiled
 from polar_bayes.priors import support_bounds
 from polar_bayes.progress import Progress
-from polar_bayes.scenes.neighbors import compare_alternatives
+from polar_bayes.scenes.neighbors import STOPPED, fit_comparisons, removed_terms, try_alternatives
 
 PRIOR_DRAWS = 500
 
 DIAGNOSTICS = ("r_hat", "k_hat", "effective_draws")
 """What a method states of its own draws, stored with the result; None where it states nothing."""
-
-STOPPED = "it was stopped before it was done"
-"""Why a comparison is missing that somebody did not wait for."""
 
 Keep = Callable[[xr.DataTree], None]
 """Called with a fit before what is only compared with it."""
@@ -109,13 +102,13 @@ def fit_request(
 
     if not with_comparisons or draws.covariance is not None:  # a point has no interval to compare
         return result({}, {}, {})
-    removed, deadline = _removed(request), method.deadline(problem)
+    removed, deadline = removed_terms(request), method.deadline(problem)
     if keep is not None:
         stopped = {"alternatives_failed": STOPPED}
         keep(result({}, dict.fromkeys(removed, STOPPED), stopped))
     methods = method.for_comparison(problem, draws)
     given = request, problem, methods, deadline, key_comparisons, progress
-    comparisons, failed = _fit_comparisons(removed, *given)
+    comparisons, failed = fit_comparisons(removed, *given)
     timings.record("comparisons")
     if STOPPED in failed.values():
         return result(comparisons, failed, {"alternatives_failed": STOPPED})
@@ -149,29 +142,6 @@ def choose_method(
     return find_method(method, "fit", one=True)
 
 
-def try_alternatives(
-    request: Request,
-    problem: Problem,
-    posterior: Values,
-    key: Array,
-    progress: Progress,
-    *,
-    deadline: float = math.inf,
-    compared: Collection[Scene] = (),
-) -> Provenance:
-    """Entries of the provenance: the comparison with alternative parts, or why there is none."""
-
-    def compare(progress: Progress) -> list[Provenance]:
-        return compare_alternatives(request, problem, posterior, key, progress, compared)
-
-    try:
-        return {"alternatives": run_until(deadline, progress, compare)}
-    except (FitError, OutOfTimeError) as error:
-        return {"alternatives_failed": str(error)}
-    except KeyboardInterrupt:  # who does not wait for it keeps the fit
-        return {"alternatives_failed": STOPPED}
-
-
 class _Timings:
     """Seconds of each stage, compilation included."""
 
@@ -196,83 +166,6 @@ def _check_room(problem: Problem, draws: int) -> None:
     readings = len(problem.program.observed) * problem.dtype.itemsize * math.prod(data.shape)
     # Noise-free readings, predicted ones and the density of each; in blocks, then all of them.
     check_memory((draws + THREADS * BLOCK) * 3 * readings)
-
-
-def _removed(request: Request) -> dict[str, list[AbstractInstrumentTerm]]:
-    """By name of a comparison, the terms of the instrument without which it fits."""
-    instrument = request.scene.instrument
-    if instrument is None or not request.scene.has(Discrepancy):
-        return {}
-    return {
-        "without_discrepancy": [each for each in instrument.terms if isinstance(each, Discrepancy)],
-        "without_instrument": list(instrument.terms),
-    }
-
-
-def _fit_comparisons(
-    removed: Mapping[str, list[AbstractInstrumentTerm]],
-    request: Request,
-    problem: Problem,
-    methods: tuple[AbstractMethod, ...],
-    deadline: float,
-    key: Array,
-    progress: Progress,
-) -> tuple[dict[str, xr.Dataset], dict[str, str]]:
-    """Posteriors of the same capture with less of the instrument, and why others failed."""
-    found: dict[str, xr.Dataset] = {}
-    failed: dict[str, str] = {}
-
-    def compare(progress: Progress) -> None:
-        for number, (name, terms) in enumerate(removed.items()):
-            done = number / len(removed)
-            progress("comparing", done)
-            try:
-                other, gone = _without(request, problem, terms)
-                z = _first_trusted(
-                    methods, other, key, lambda *_, done=done: progress("comparing", done)
-                )
-                values = other.constrain(z)
-                kept = {name: x for name, x in values.items() if name not in gone}
-                found[name] = posterior_of(other.program, kept)
-            except FitError as error:  # a failed comparison must not cost the user the fit
-                failed[name] = str(error)
-
-    late = ""
-    try:
-        run_until(deadline, progress, compare)
-        progress("comparing", 1.0)
-    except OutOfTimeError as error:
-        late = str(error)
-    except KeyboardInterrupt:  # who does not wait for it keeps the fit
-        late = STOPPED
-    done = dict(found)  # an abandoned thread may still write to its own
-    return done, {name: late for name in removed if late and name not in done} | failed
-
-
-def _first_trusted(
-    methods: tuple[AbstractMethod, ...], problem: Problem, key: Array, progress: Progress
-) -> np.ndarray:
-    """Draws of the first method that trusts enough of its own, or of the last."""
-    for method in methods[:-1]:
-        with contextlib.suppress(FitError):
-            draws = method.run(problem, key, progress)
-            if not draws.doubts and draws.effective_draws >= 0.5 * SMALLEST_ESS:
-                return draws.z
-    return methods[-1].run(problem, key, progress).z
-
-
-def _without(
-    request: Request, problem: Problem, terms: list[AbstractInstrumentTerm]
-) -> tuple[Problem, set[str]]:
-    """The problem without terms of the instrument, and the parameters that it does not have."""
-    gone = {name for term in terms for name in term.parameters}
-    neutral = {name: value for term in terms for name, value in term.neutral.items()}
-    if all(term.neutral or not term.parameters for term in terms) and problem.data.held:
-        return problem.hold(neutral), gone
-    scene = request.scene
-    for term in terms:
-        scene = scene.without(type(term))
-    return make_problem(dataclasses.replace(request, scene=scene), problem.key), gone
 
 
 def _model_settings(model: Callable) -> Provenance:

@@ -1,4 +1,6 @@
-r"""Alternatives to the parts of a scene: does another one explain the readings, and what changes?
+r"""What a fit is compared with: its scene without the instrument, and with other parts.
+
+The comparisons without terms of an instrument hold these at the values where they change nothing.
 
 A fit rests on parts that nobody has measured, such as a distribution of slopes. For each part that
 names an alternative (`Part.alternatives`) the posterior of the scene with that one is found near
@@ -12,23 +14,28 @@ Source: Tierney & Kadane (1986), J. Am. Stat. Assoc. 81, 82; Kass & Raftery (199
 Assoc. 90, 773 (Bayes factors).
 """
 
+import contextlib
 import dataclasses
 import itertools
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import xarray as xr
 from jaxtyping import Array
 from numpyro import distributions as dist
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.initialization import HEAVY_MODE, JointInit
-from polar_bayes.inference.problem import Problem, compile_request
+from polar_bayes.inference.problem import Problem, compile_request, make_problem
 from polar_bayes.inference.program import Values
 from polar_bayes.inference.request import Request
-from polar_bayes.inference.result import Provenance
+from polar_bayes.inference.result import Provenance, posterior_of
+from polar_bayes.methods.method import AbstractMethod
+from polar_bayes.numerics.compile import OutOfTimeError, run_until
+from polar_bayes.numerics.mcse import SMALLEST_ESS
 from polar_bayes.numerics.optimize import (
     DifferencedPotential,
     Modes,
@@ -36,10 +43,120 @@ from polar_bayes.numerics.optimize import (
     find_modes,
     symmetrize,
 )
+from polar_bayes.physics.instrument import AbstractInstrumentTerm, Discrepancy
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.variants import alternatives_of
 from polar_bayes.priors import resolve_priors
 from polar_bayes.progress import Progress
+
+STOPPED = "it was stopped before it was done"
+"""Why a comparison is missing that somebody did not wait for."""
+
+
+# --- The same scene without terms of its instrument -----------------------------------------------
+
+
+def removed_terms(request: Request) -> dict[str, list[AbstractInstrumentTerm]]:
+    """By name of a comparison, the terms of the instrument without which it fits."""
+    instrument = request.scene.instrument
+    if instrument is None or not request.scene.has(Discrepancy):
+        return {}
+    return {
+        "without_discrepancy": [each for each in instrument.terms if isinstance(each, Discrepancy)],
+        "without_instrument": list(instrument.terms),
+    }
+
+
+def fit_comparisons(
+    removed: Mapping[str, list[AbstractInstrumentTerm]],
+    request: Request,
+    problem: Problem,
+    methods: tuple[AbstractMethod, ...],
+    deadline: float,
+    key: Array,
+    progress: Progress,
+) -> tuple[dict[str, xr.Dataset], dict[str, str]]:
+    """Posteriors of the same capture with less of the instrument, and why others failed."""
+    found: dict[str, xr.Dataset] = {}
+    failed: dict[str, str] = {}
+
+    def compare(progress: Progress) -> None:
+        for number, (name, terms) in enumerate(removed.items()):
+            done = number / len(removed)
+            progress("comparing", done)
+            try:
+                other, gone = _without(request, problem, terms)
+                z = _first_trusted(
+                    methods, other, key, lambda *_, done=done: progress("comparing", done)
+                )
+                values = other.constrain(z)
+                kept = {name: x for name, x in values.items() if name not in gone}
+                found[name] = posterior_of(other.program, kept)
+            except FitError as error:  # a failed comparison must not cost the user the fit
+                failed[name] = str(error)
+
+    late = ""
+    try:
+        run_until(deadline, progress, compare)
+        progress("comparing", 1.0)
+    except OutOfTimeError as error:
+        late = str(error)
+    except KeyboardInterrupt:  # who does not wait for it keeps the fit
+        late = STOPPED
+    done = dict(found)  # an abandoned thread may still write to its own
+    return done, {name: late for name in removed if late and name not in done} | failed
+
+
+def _first_trusted(
+    methods: tuple[AbstractMethod, ...], problem: Problem, key: Array, progress: Progress
+) -> np.ndarray:
+    """Draws of the first method that trusts enough of its own, or of the last."""
+    for method in methods[:-1]:
+        with contextlib.suppress(FitError):
+            draws = method.run(problem, key, progress)
+            if not draws.doubts and draws.effective_draws >= 0.5 * SMALLEST_ESS:
+                return draws.z
+    return methods[-1].run(problem, key, progress).z
+
+
+def _without(
+    request: Request, problem: Problem, terms: list[AbstractInstrumentTerm]
+) -> tuple[Problem, set[str]]:
+    """The problem without terms of the instrument, and the parameters that it does not have."""
+    gone = {name for term in terms for name in term.parameters}
+    neutral = {name: value for term in terms for name, value in term.neutral.items()}
+    if all(term.neutral or not term.parameters for term in terms) and problem.data.held:
+        return problem.hold(neutral), gone
+    scene = request.scene
+    for term in terms:
+        scene = scene.without(type(term))
+    return make_problem(dataclasses.replace(request, scene=scene), problem.key), gone
+
+
+# --- Other parts ----------------------------------------------------------------------------------
+
+
+def try_alternatives(
+    request: Request,
+    problem: Problem,
+    posterior: Values,
+    key: Array,
+    progress: Progress,
+    *,
+    deadline: float = math.inf,
+    compared: Collection[Scene] = (),
+) -> Provenance:
+    """Entries of the provenance: the comparison with alternative parts, or why there is none."""
+
+    def compare(progress: Progress) -> list[Provenance]:
+        return compare_alternatives(request, problem, posterior, key, progress, compared)
+
+    try:
+        return {"alternatives": run_until(deadline, progress, compare)}
+    except (FitError, OutOfTimeError) as error:
+        return {"alternatives_failed": str(error)}
+    except KeyboardInterrupt:  # who does not wait for it keeps the fit
+        return {"alternatives_failed": STOPPED}
 
 
 def compare_alternatives(

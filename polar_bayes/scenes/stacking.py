@@ -24,7 +24,8 @@ from polar_bayes.methods.nuts import Nuts
 from polar_bayes.numerics.psis import FINITE_VARIANCE
 from polar_bayes.progress import Progress
 from polar_bayes.scenes.comparison import FitArguments, compare_candidates
-from polar_bayes.scenes.fit_request import STOPPED, Keep, fit_request, try_alternatives
+from polar_bayes.scenes.fit_request import Keep, fit_request
+from polar_bayes.scenes.neighbors import STOPPED, try_alternatives
 
 OF_DRAWS = (
     *("posterior", "sample_stats", "log_prior", "log_likelihood"),

@@ -21,7 +21,7 @@ from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.observation.data import observe
-from polar_bayes.scenes.fit_request import STOPPED
+from polar_bayes.scenes.neighbors import STOPPED
 
 SHORT = pb.methods.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50)
 GROUPS = {
