@@ -8,7 +8,8 @@ A value is one number, one for each wavelength, or an image (y, x): its rank say
 """
 
 import dataclasses
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 import jax
@@ -19,7 +20,8 @@ from jaxtyping import Array
 
 from polar_bayes.capture.schema import Interval, validate
 from polar_bayes.errors import CaptureError, FitError, SceneError
-from polar_bayes.numerics.compile import compiled
+from polar_bayes.numerics.compile import LRUCache, compiled
+from polar_bayes.numerics.fingerprint import fingerprint
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink, noise_parameters
 from polar_bayes.physics.geometry import Geometry
@@ -347,8 +349,7 @@ def simulate(
     image = image_shape(truth, levels)
     given = protocol.angles(), wavelengths, truth, levels, np.uint32(seed)
     with jax.enable_x64(True):
-        record = compiled(_record, static_argnames=("scene", "links", "image"))
-        found = record(setup.scene, tuple(links.items()), image, *given)
+        found = _recorder(setup.scene, links, image)(*given)
     recorded = {key: np.asarray(value) for key, value in found.items()}
     name = name or (preset if isinstance(preset, str) else "simulated")
     attributes: dict[str, str | int] = {"name": name, "seed": seed}
@@ -369,9 +370,21 @@ def _checked_links(links: Mapping[str, AbstractLink]) -> dict[str, AbstractLink]
     return dict(links)
 
 
+_RECORDERS: LRUCache[Callable[..., dict[str, Array]]] = LRUCache(16)
+
+
+def _recorder(
+    scene: Scene, links: Mapping[str, AbstractLink], image: tuple[int, ...]
+) -> Callable[..., dict[str, Array]]:
+    """`_record` of a scene and its links, compiled; another one where their code has changed."""
+    scene = dataclasses.replace(scene)  # without its ledger
+    key = fingerprint(scene, links, tuple(links), image, code=(scene, links))
+    return _RECORDERS.of(key, lambda: compiled(functools.partial(_record, scene, links, image)))
+
+
 def _record(
     scene: Scene,
-    links: tuple[tuple[str, AbstractLink], ...],
+    links: Mapping[str, AbstractLink],
     image: tuple[int, ...],
     angles: Mapping[str, Array],
     wavelengths: Array,
@@ -380,8 +393,7 @@ def _record(
     seed: Array,
 ) -> dict[str, Array]:
     """Readings with the dims of the layout: intensity first, since noise depends on it."""
-    link_of = dict(links)
-    layout = _layout(angles, wavelengths, link_of, image)
+    layout = _layout(angles, wavelengths, links, image)
     key_intensity, key_rest = jax.random.split(jax.random.key(seed))
     axes = len(layout.shape)
     parameters = {name: _align_image(x, axes - 1) for name, x in truth.items()}
@@ -398,17 +410,21 @@ def _record(
     }
     recorded: dict[str, Array] = {}
     data = layout
-    if "intensity" in link_of:
-        link = link_of["intensity"]
+    if "intensity" in links:
+        link = links["intensity"]
         intensity = link.distribution("intensity", prediction, layout, levels).sample(key_intensity)
         intensity = jnp.clip(intensity, 0.0, 1.0)  # of full scale
         recorded |= {"intensity": intensity, "saturated": intensity >= 1.0}
         data = dataclasses.replace(layout, brightness=intensity, saturated=recorded["saturated"])
-    for (name, link), key in zip(links, jax.random.split(key_rest, len(links)), strict=True):
+    for (name, link), key in zip(
+        links.items(), jax.random.split(key_rest, len(links)), strict=True
+    ):
         if name != "intensity":
             recorded[name] = link.distribution(name, prediction, data, levels).sample(key)
     recorded |= _physical(recorded)
-    errors = {f"{name}_error": layout.errors[name] for name, link in links if link.reads_errors}
+    errors = {
+        f"{name}_error": layout.errors[name] for name, link in links.items() if link.reads_errors
+    }
     return recorded | errors
 
 

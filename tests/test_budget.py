@@ -16,24 +16,24 @@ CODE = {
     "design": 1068,
     "diagnostics": 1689,
     "importers": 1159,
-    "inference": 2716,
+    "inference": 2667,
     "maps": 1734,
     "methods": 1229,
-    "numerics": 815,
+    "numerics": 882,
     "observation": 472,
     "physics": 2383,
     "reporting": 2986,
     "scenes": 1665,
-    "own files": 1481,
+    "own files": 1490,
     "models": 318,
-    "tests": 22552,
+    "tests": 22592,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 23278,
+    "code": 23305,
     "classes": 332,
-    "constants": 414,
+    "constants": 415,
     "Any": 168,
     "longest function": 116,
 }

@@ -11,7 +11,7 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -88,11 +88,12 @@ def keep_compiled_programs() -> None:
     compilation_cache.reset_cache()  # JAX looks for the folder once, when it first compiles
 
 
-def compiled(function: Callable, *, static_argnames: Sequence[str] = ()) -> Any:
+def compiled(function: Callable) -> Any:
     """The function under `jax.jit`, with `COMPILER_OPTIONS` on a CPU."""
     keep_compiled_programs()
-    options = COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
-    return jax.jit(function, compiler_options=options, static_argnames=static_argnames)
+    return jax.jit(
+        function, compiler_options=COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
+    )
 
 
 class JitOnce:

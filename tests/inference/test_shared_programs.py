@@ -10,6 +10,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -344,6 +345,56 @@ def test_fits_side_by_side_leave_warnings_as_they_were() -> None:
     thread.join()
     assert heard == []
     assert list(warnings.filters) == before
+
+
+CELL = """
+import dataclasses
+import jax
+import polar_bayes as pb
+def shift(x):
+    return x
+@dataclasses.dataclass(frozen=True)
+class Body(pb.Lambertian):
+    def light(self, *given):
+        return jax.tree.map(lambda x: shift(x), super().light(*given))
+class Model:
+    def __init__(self):
+        self.itself = self
+    def __call__(self, data, scene, priors, links):
+        return Body().light(data)
+"""
+
+
+def test_what_is_edited_in_a_notebook_is_another_scene_to_simulate_and_to_fit() -> None:
+    """Its classes stay as they are: their functions see what the next cell defines."""
+    cells: dict[str, Any] = {"__name__": "__main__"}
+    exec(CELL, cells)
+    model, body = cells["Model"](), cells["Body"]()
+    scene = pb.Scene(pb.RoughSurface(), body, pb.StokesMixing())
+    few = pb.simulation.Protocol(views=4, wavelengths=())
+
+    def asked() -> tuple[str, float]:
+        capture = pb.simulate("plastic", scene=scene, protocol=few)
+        return cache_key(model, scene, {}, LINKS), float(capture["dop"].sum())
+
+    before = asked()
+    assert asked() == before
+    exec("def shift(x):\n    return 2.0 * x", cells)
+    after = asked()
+    assert after[0] != before[0]
+    assert after[1] != before[1]
+    assert type(body).light.__globals__ is cells
+
+
+def test_a_link_that_holds_an_array_simulates() -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Tabled(pb.links.BetaLink):
+        table: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(3))
+
+    few = pb.simulation.Protocol(views=4, wavelengths=())
+    found = pb.simulate("plastic", links={"dop": Tabled()}, protocol=few)
+    plain = pb.simulate("plastic", links={"dop": pb.links.BetaLink()}, protocol=few)
+    xr.testing.assert_equal(found, plain)
 
 
 MOST_PROGRAMS = {
