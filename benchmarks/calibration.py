@@ -119,7 +119,7 @@ def main(count: int, methods: Sequence[str]) -> None:
             took.append(time.perf_counter() - start)
         table, fits = pb.summary(found), found["fits"].to_dataset()
         end = f"{int(np.sum(fits['status'] != 0)):7d} {table['p_value'].min():8.4f}"
-        line(method, took, count / took[-1], fits["effective_draws"].to_numpy(), end)
+        line(method, took, count / took[-1], fits["ess"].to_numpy(), end)
 
 
 if __name__ == "__main__":

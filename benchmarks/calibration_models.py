@@ -142,7 +142,7 @@ def said(found: xr.DataTree) -> str:
     fits = found["fits"].to_dataset()
     statuses = fits["status"].to_numpy()
     counts = {each.name.lower(): int(np.sum(statuses == each)) for each in Status}
-    worth = fits["effective_draws"].to_numpy()
+    worth = fits["ess"].to_numpy()
     worth = worth[np.isfinite(worth)]
     lines = [
         *pb.verdict(found).sentences,

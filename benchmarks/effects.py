@@ -21,7 +21,7 @@ from polar_bayes.inference.result import provenance_of
 from polar_bayes.physics.scene import FULL_SCENES, MANY_FACETS
 from polar_bayes.scenes.effects import ledger_table
 
-METHOD = pb.methods.Nuts(draws=1000, most_draws=4000, effective_draws=1500)
+METHOD = pb.methods.Nuts(draws=1000, most_draws=4000, ess=1500)
 
 PAINT = pb.Scene(
     surface=pb.RoughSurface(

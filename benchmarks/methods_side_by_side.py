@@ -42,7 +42,7 @@ def judged(found: xr.DataTree, seconds: float) -> tuple[dict[str, float], np.nda
         "coverage": np.concatenate(held).mean(),
         "numbers": np.concatenate(held).size,
         "wrong": wrong.sum(),
-        "draws": np.nanmedian(found["fits"]["effective_draws"].to_numpy()[good]),
+        "draws": np.nanmedian(found["fits"]["ess"].to_numpy()[good]),
         "p": pb.summary(found)["p_value"].min(),
         "per second": good.size / seconds,
     }, good

@@ -3,7 +3,7 @@
     POLAR_BAYES_DATA=FOLDER python benchmarks/missed_arm.py --seeds 4
 
 FOLDER holds `river_water/river_water_q.csv`. For each seed and method: the share of draws whose
-roughness is above 0.08, their mean index, the 95% interval of the index, R-hat or Pareto k-hat,
+roughness is above 0.08, their mean index, the 95% interval of the index, R-hat or Pareto k,
 and the seconds of the fit, the first of which compiles.
 """
 
@@ -45,7 +45,7 @@ def main(seeds: int, methods: list[str]) -> None:
             above = posterior["roughness"].to_numpy().ravel() > ARM
             low, high = np.quantile(index, (0.025, 0.975))
             measure = (
-                f"R-hat {stated['r_hat']:.3f}" if name == "nuts" else f"k {stated['k_hat']:.2f}"
+                f"R-hat {stated['r_hat']:.3f}" if name == "nuts" else f"k {stated['pareto_k']:.2f}"
             )
             print(
                 f"{name:11}seed {seed}  arm {above.mean():6.1%}, n "

@@ -53,7 +53,7 @@ study = pb.accuracy(
     fresh=False,
     reference=pb.benchmark.Reference(error=0.03),
 )
-columns = ["error", "worst", "resolved", "effective_draws", "gradients", "seconds_again"]
+columns = ["error", "worst", "resolved", "ess", "gradients", "seconds_again"]
 pb.summary(study)[columns].round(3)
 
 # %%

@@ -26,7 +26,7 @@ from polar_bayes.diagnostics.coverage import map_scalars
 from polar_bayes.errors import FitError, OutputError
 from polar_bayes.frames import PrintedFrame
 from polar_bayes.inference.batching import Status
-from polar_bayes.inference.files import FIT, check_fit
+from polar_bayes.inference.files import FIT, check_fit, in_present_names
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.maps.lazy import count_pixels, criticism_sentences, open_map
 from polar_bayes.paths import as_path, atomic_write, existing_file
@@ -264,5 +264,5 @@ def _read(path: str | os.PathLike[str], wanted: str) -> tuple[Result, str]:
     file = existing_file(path, wanted)
     hint = "give the file that polar_bayes.save or a command wrote"
     broken = FitError("it cannot be read as netCDF", where=str(file), hint=hint)
-    tree = read_netcdf(xr.DataTree, file, broken)
+    tree = in_present_names(read_netcdf(xr.DataTree, file, broken))
     return (tree if tree.children else tree.to_dataset()), str(file)

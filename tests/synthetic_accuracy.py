@@ -36,8 +36,8 @@ def make_accuracy(
                 name: ("row", np.full(len(rows), value))
                 for name, value in {
                     "r_hat": np.nan,
-                    "k_hat": 0.3,
-                    "effective_draws": 1000.0,
+                    "pareto_k": 0.3,
+                    "ess": 1000.0,
                     "gradients": 5e3,
                     "densities": 0.0,
                     "peak_memory": 900.0 if fresh else np.nan,
@@ -61,7 +61,7 @@ def make_accuracy(
         attrs={
             "reference": "NUTS",
             "reference_draws": 10000,
-            "reference_effective_draws": 5000.0,
+            "reference_ess": 5000.0,
             "reference_r_hat": 1.001,
             "reference_error": 0.012,
             "reference_doubts": doubts,

@@ -91,17 +91,17 @@ def _readings(
 
 
 def _fits(count: int, failed: tuple[int, ...]) -> dict:
-    status, approach = np.full(count, Status.GOOD), np.full(count, MethodUsed.IMPORTANCE)
-    approach[::4] = MethodUsed.NUTS
-    status[list(failed)], approach[list(failed)] = Status.NOT_CONVERGED, MethodUsed.NONE
+    status, method = np.full(count, Status.GOOD), np.full(count, MethodUsed.IMPORTANCE)
+    method[::4] = MethodUsed.NUTS
+    status[list(failed)], method[list(failed)] = Status.NOT_CONVERGED, MethodUsed.NONE
     k = np.where(np.arange(count) % 10 == 0, 0.9, 0.2)
     draws = np.linspace(100.0, 500.0, count)
     k[list(failed)] = draws[list(failed)] = np.nan
-    words = {"status": Status, "approach": MethodUsed}
+    words = {"status": Status, "method": MethodUsed}
     flags = {name: " ".join(each.name.lower() for each in kinds) for name, kinds in words.items()}
     return {
         "status": ("simulation", status, {"flag_meanings": flags["status"]}),
-        "approach": ("simulation", approach, {"flag_meanings": flags["approach"]}),
+        "method": ("simulation", method, {"flag_meanings": flags["method"]}),
         "pareto_k": ("simulation", k),
-        "effective_draws": ("simulation", draws),
+        "ess": ("simulation", draws),
     }

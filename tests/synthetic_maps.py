@@ -1,4 +1,4 @@
-"""Maps made by hand: every quantile, status and approach as a test wants it."""
+"""Maps made by hand: every quantile, status and method as a test wants it."""
 
 import json
 
@@ -22,7 +22,7 @@ def make_maps(
     *,
     width: float = 1.0,
     status: np.ndarray | None = None,
-    approach: np.ndarray | None = None,
+    methods: np.ndarray | None = None,
     wavelengths: tuple[float, ...] = (),
     method: str = "corrected-laplace",
     **provenance: object,
@@ -42,7 +42,7 @@ def make_maps(
         found[f"{name}_quantile"] = (("quantile", *axes), np.float32(mean + width * steps))
     found["pareto_k"] = (("y", "x"), np.where(status == Status.NOT_TRUSTED, 0.9, 0.2))
     found["status"] = flags(Status, status)
-    found["approach"] = flags(MethodUsed, told if approach is None else approach)
+    found["method"] = flags(MethodUsed, told if methods is None else methods)
     about = {"method": method, "seed": 3, **provenance}
     coords: dict = {"quantile": LEVELS_HERE}
     coords |= {"wavelength": list(wavelengths)} if wavelengths else {}

@@ -16,7 +16,7 @@ CODE = {
     "design": 1068,
     "diagnostics": 1689,
     "importers": 1159,
-    "inference": 2667,
+    "inference": 2689,
     "maps": 1734,
     "methods": 1229,
     "numerics": 882,
@@ -26,14 +26,14 @@ CODE = {
     "scenes": 1665,
     "own files": 1490,
     "models": 318,
-    "tests": 22592,
+    "tests": 22612,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 23305,
+    "code": 23327,
     "classes": 332,
-    "constants": 415,
+    "constants": 416,
     "Any": 168,
     "longest function": 116,
 }

@@ -93,7 +93,7 @@ def compile_model(folder: Path) -> dict[str, list[float]]:
     """The capture, and a long run: mean, sd and Monte Carlo error of the mean of each parameter."""
     capture = layout()
     pb.save_capture(capture, folder / "capture.nc")
-    method = pb.methods.Nuts(draws=LONG, most_draws=LONG, effective_draws=1.0)
+    method = pb.methods.Nuts(draws=LONG, most_draws=LONG, ess=1.0)
     found = pb.summary(pb.fit(capture, method=method, scene=SCENE, seed=99))
     long = {
         str(name): [float(row["mean"]), float(row["sd"]), float(row["mcse_mean"])]

@@ -34,7 +34,7 @@ from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress, no_progress, with_progress
 
-DIAGNOSTICS = ("r_hat", "k_hat", "effective_draws", "gradients", "densities")
+DIAGNOSTICS = ("r_hat", "pareto_k", "ess", "gradients", "densities")
 COSTS_OF_PROCESS = ("seconds_first", "peak_memory", "memory_before")
 """Costs that are known only where a trial has a process of its own."""
 
@@ -45,8 +45,8 @@ DESCRIPTIONS: Mapping[str, tuple[str, str]] = {
     "high_error": ("97.5% end of the interval minus that of the reference, in its sds", "1"),
     "wasserstein": ("Wasserstein distance from the reference, in its sds", "1"),
     "r_hat": ("largest R-hat of all coordinates", "1"),
-    "k_hat": ("Pareto k-hat of the importance weights", "1"),
-    "effective_draws": ("effective number of independent draws", "1"),
+    "pareto_k": ("Pareto k of the importance weights", "1"),
+    "ess": ("effective number of independent draws", "1"),
     "gradients": ("evaluations of the log density with its gradient", "1"),
     "densities": ("evaluations of the log density alone", "1"),
     "seconds_first": ("time to the parameters of all draws in a fresh process", "s"),
@@ -228,7 +228,7 @@ def _dataset(
         attrs={
             "reference": reference.method,
             "reference_draws": int(draws.shape[1]),
-            "reference_effective_draws": float(reference.posterior.effective_draws),
+            "reference_ess": float(reference.posterior.ess),
             "reference_r_hat": float(reference.posterior.r_hat),
             "reference_error": reference.error,
             "reference_doubts": "; ".join(reference.doubts),

@@ -21,7 +21,7 @@ STUDY = Schema(
 )
 
 NUMBERS = (
-    *("r_hat", "k_hat", "effective_draws", "gradients", "densities"),
+    *("r_hat", "pareto_k", "ess", "gradients", "densities"),
     *("seconds_first", "seconds_again", "peak_memory"),
 )
 

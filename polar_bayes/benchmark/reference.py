@@ -84,7 +84,7 @@ class Reference:
             warmup=1000,
             draws=draws,
             most_draws=2 * draws,
-            effective_draws=goal,
+            ess=goal,
             target_acceptance=0.95,
             max_tree_depth=10,
         )

@@ -108,7 +108,7 @@ def sample_point(found: PosteriorDraws, key: Array, count: int = 1000) -> Poster
     finite = np.where(free[:, None] | free, 0.0, covariance)
     shape = CHAINS, count // CHAINS
     z = numpy_generator(key).multivariate_normal(found.z[0, 0], finite, shape)
-    return dataclasses.replace(found, z=z, stats={}, effective_draws=float(count))
+    return dataclasses.replace(found, z=z, stats={}, ess=float(count))
 
 
 def _memory() -> float:

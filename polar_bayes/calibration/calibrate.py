@@ -93,8 +93,8 @@ def calibrate(
     Returns:
         A tree with the groups `prior_sbc` (probability integral transforms, which
         `arviz_plots.plot_ecdf_pit(tree, sample_dims=["simulation"])` shows), `truth`, `marginals`
-        (mean, sd, quantiles and ranked score of every fit) and `fits` (status, approach, pareto_k,
-        effective_draws, condition, steps). A fit that failed is NaN, and counted in `status`. Where
+        (mean, sd, quantiles and ranked score of every fit) and `fits` (status, method, pareto_k,
+        ess, condition, steps). A fit that failed is NaN, and counted in `status`. Where
         readings are ranked, there are also `predictive_pit` (of replicated readings), `loo_pit` (of
         those left out) and `readings` (which ones, and Pareto k); where they cannot be, the
         attribute `polar_bayes` states the reason.

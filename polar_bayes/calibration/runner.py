@@ -149,7 +149,7 @@ def fit_block(plan: CalibrationPlan, numbers: np.ndarray) -> xr.DataTree:
             statistic.describe(found.at, found.draws, found.weights)
     groups = _label_groups(compiled, numbers, truth, scores, marginals)
     fits: dict[str, tuple] = {name: ("simulation", x) for name, x in outcome._asdict().items()}
-    for name, flags in {"status": Status, "approach": MethodUsed}.items():
+    for name, flags in {"status": Status, "method": MethodUsed}.items():
         meanings = " ".join(flag.name.lower() for flag in flags)
         fits[name] = (*fits[name], {"flag_meanings": meanings})
     groups["fits"] = xr.Dataset(fits, {"simulation": numbers})

@@ -16,7 +16,7 @@ import scipy.stats
 from jaxtyping import Float
 
 from polar_bayes.inference.program import Values
-from polar_bayes.numerics.psis import effective_draws
+from polar_bayes.numerics.psis import weighted_ess
 
 
 class PitCrps:
@@ -56,7 +56,7 @@ def randomized_pit(
     # uniform number, however few they are.
     below = np.sum(weights * (draws < value[:, None]), axis=-1)
     tied = np.sum(weights * (draws == value[:, None]), axis=-1)
-    number = effective_draws(weights) if count is None else count
+    number = weighted_ess(weights) if count is None else count
     return (number * (below + uniform * tied) + uniform) / (number + 1)
 
 

@@ -61,8 +61,8 @@ CALIBRATION = Schema(
         "fits": Group(
             required=True,
             variables={"status": _SIMULATION},
-            kinds={"status": FLAGS, "approach": FLAGS},
-            names=("status", "approach", "effective_draws", "pareto_k"),
+            kinds={"status": FLAGS, "method": FLAGS},
+            names=("status", "method", "ess", "pareto_k"),
             dims=_SIMULATION,
             extra_dims=False,
             variable_attributes={"flag_meanings?": TEXT},

@@ -33,9 +33,9 @@ def checks_made(method: str, criticism: pd.DataFrame) -> tuple[tuple[str, ...], 
     """
     how = "chains (R-hat, effective sample sizes, divergences)"
     if method in APPROXIMATIONS:
-        how = "the approximation (Pareto k-hat)"
+        how = "the approximation (Pareto k)"
     elif method in WEIGHTED:
-        how = "weighted draws (effective sample size, Pareto k-hat)"
+        how = "weighted draws (effective sample size, Pareto k)"
     made, missing = [how], []
     # What is absent only describes, and says nothing against the intervals.
     for check, row in criticism.drop(index=["absent"], errors="ignore").iterrows():

@@ -1,7 +1,7 @@
 """Convergence: a table of every parameter, and a verdict on the fit in sentences.
 
 Source: Vehtari et al. (2021), Bayesian Analysis 16(2) (R-hat, ESS); Vehtari et al. (2024), JMLR
-25(72) (Pareto k-hat).
+25(72) (Pareto k).
 """
 
 import dataclasses
@@ -158,14 +158,14 @@ def json_summary(result: xr.DataTree | FitView) -> dict[str, Any]:
     }
 
 
-def laplace_k_hat(result: xr.DataTree | FitView) -> float:
-    """Pareto k-hat of the importance weights of Laplace draws or of a variational guide."""
+def laplace_pareto_k(result: xr.DataTree | FitView) -> float:
+    """Pareto k of the importance weights of Laplace draws or of a variational guide."""
     return _smoothed_weights(result)[1]
 
 
 @once
 def _smoothed_weights(fit: FitView) -> tuple[np.ndarray, float]:
-    """Pareto-smoothed importance weights of the draws, and k-hat: none and NaN without weights."""
+    """Pareto-smoothed weights of the draws, and Pareto k; none and NaN without weights."""
     # $$ w = p(z | data) / q(z) $$
     # Source: Vehtari et al. (2024), JMLR 25(72).
     if "log_weight" not in fit.stats:
@@ -175,8 +175,8 @@ def _smoothed_weights(fit: FitView) -> tuple[np.ndarray, float]:
         return np.empty(0), math.nan
     if np.ptp(log_weight) < 1e-12:
         return np.full(log_weight.size, 1.0 / log_weight.size), -math.inf
-    weights, k_hat = smooth(log_weight[None])
-    return weights[0], float(k_hat[0])
+    weights, pareto_k = smooth(log_weight[None])
+    return weights[0], float(pareto_k[0])
 
 
 def _draw_rows(found: Sequence[Scalar]) -> np.ndarray:
@@ -290,7 +290,7 @@ def _chain_problems(fit: FitView) -> Iterator[str]:
 
 def _weight_problems(fit: FitView) -> Iterator[str]:
     """Weighted draws that are worth fewer independent ones than chains must have."""
-    effective = fit.provenance.get("effective_draws")
+    effective = fit.provenance.get("ess")
     if fit.method in WEIGHTED and effective is not None and effective < SMALLEST_ESS:
         yield (
             f"The effective sample size of the weighted draws is {effective:.0f} (at least "
@@ -302,15 +302,15 @@ def _weight_problems(fit: FitView) -> Iterator[str]:
 def _approximation_cautions(fit: FitView) -> Iterator[str]:
     if fit.method not in APPROXIMATIONS or "log_weight" not in fit.stats:
         return
-    weights, k_hat = _smoothed_weights(fit)
-    if k_hat <= MAX_PARETO_K:
+    weights, pareto_k = _smoothed_weights(fit)
+    if pareto_k <= MAX_PARETO_K:
         yield from _corrections(weights, fit.scalars)
     else:
         draws, shape = ("the guide's draws", "the guide")
         if fit.method == "laplace":
             draws, shape = ("the Laplace draws", "a normal distribution")
         yield (
-            f"Pareto k-hat of {draws} is {k_hat:.2f} (at most {MAX_PARETO_K}): the posterior is "
+            f"Pareto k of {draws} is {pareto_k:.2f} (at most {MAX_PARETO_K}): the posterior is "
             f"not close to {shape}; use method='nuts' for intervals."
         )
 
@@ -339,7 +339,7 @@ def _corrections(weights: np.ndarray, found: Sequence[Scalar]) -> Iterator[str]:
 def _mode_cautions(provenance: Provenance) -> Iterator[str]:
     weights = (provenance.get("modes") or {}).get("weights", [])
     # Weighted draws of all modes have told whether chains have their tails.
-    compared = (provenance.get("tails") or {}).get("k_hat", math.inf) <= MAX_PARETO_K
+    compared = (provenance.get("tails") or {}).get("pareto_k", math.inf) <= MAX_PARETO_K
     if len(weights) > 1 and weights[1] > LIMITS.second_mode and not compared:
         heaviest = ", and only the heaviest is described here; use method='nuts', or "
         effects = {
@@ -359,13 +359,13 @@ def _mode_cautions(provenance: Provenance) -> Iterator[str]:
 def _tail_cautions(fit: FitView) -> Iterator[str]:
     """Tails of chains that are too light by weighted draws, which reach what chains may miss."""
     tails = fit.provenance.get("tails") or {}
-    if not tails or not tails["k_hat"] <= MAX_PARETO_K:
+    if not tails or not tails["pareto_k"] <= MAX_PARETO_K:
         return
     nominal, missed = CENTRAL_95[0], []
     variance = nominal * (1.0 - nominal)
     for scalar, shares in with_entries(fit.scalars, tails["shares"]):
         row = summary(fit).loc[scalar.label]
-        error = math.sqrt(variance / row["ess_tail"] + variance / tails["effective_draws"])
+        error = math.sqrt(variance / row["ess_tail"] + variance / tails["ess"])
         for share, side, end in zip(shares, ("below", "above"), ("q2.5", "q97.5"), strict=True):
             if share > max(2.0 * nominal, nominal + LIMITS.tail_errors * error):
                 missed.append((share, f"{scalar.label} {side} {row[end]:.3g} ({share:.1%})"))
@@ -373,7 +373,7 @@ def _tail_cautions(fit: FitView) -> Iterator[str]:
         names = listed(text for _, text in sorted(missed, reverse=True))
         yield (
             "The chains may have missed an arm of the posterior: where they have 2.5% of their "
-            f"draws, weighted draws (Pareto k-hat {tails['k_hat']:.2f}) have more, {names}; "
+            f"draws, weighted draws (Pareto k {tails['pareto_k']:.2f}) have more, {names}; "
             "compare Importance(draws=2048, rounds=6), or sample longer."
         )
 

@@ -110,6 +110,36 @@ def _check_mapping(value: Mapping[str, Any], spec: Mapping[str, Spec], where: st
             yield from _check_json(item, spec[key], f"{where}.{name}")
 
 
+RENAMED = {
+    "approach": "method",
+    "effective_draws": "ess",
+    "k_hat": "pareto_k",
+    "reference_effective_draws": "reference_ess",
+}
+"""Diagnostics by the names that version 0.1 wrote, and by those of today."""
+
+
+def in_present_names[Result: (xr.DataTree, xr.Dataset)](result: Result) -> Result:
+    """A result that an earlier version may have written, its diagnostics by their present names."""
+    if isinstance(result, xr.DataTree):
+        for node in result.subtree:
+            node.dataset = _renamed(node.to_dataset())
+        return result
+    return _renamed(result)
+
+
+def _renamed(data: xr.Dataset) -> xr.Dataset:
+    is_table = not {"status", "seconds_first"}.isdisjoint(data)  # a map, calibration or study
+    new = RENAMED if is_table else {}
+    found = data.rename({name: new[name] for name in new if name in data})
+    found.attrs = {new.get(str(name), str(name)): value for name, value in data.attrs.items()}
+    if isinstance(stated := found.attrs.get(PROVENANCE), str):
+        for old in ("effective_draws", "k_hat"):
+            stated = stated.replace(f'"{old}":', f'"{RENAMED[old]}":')
+        found.attrs[PROVENANCE] = stated.replace("effective_draws=", "ess=")  # of Nuts
+    return found
+
+
 # --- Groups and variables -------------------------------------------------------------------------
 
 DRAWS = ("chain", "draw")
@@ -329,13 +359,13 @@ _FIT_PROVENANCE: Mapping[str, Spec] = {
     "capture?": {EACH: ANY},
     "comparisons_failed?": {EACH: TEXT},
     "prior_probability?": {EACH: [NUMBER]},
-    "tails?": {"k_hat": NUMBER, "effective_draws": POSITIVE, "shares": {EACH: [SHARES]}},
+    "tails?": {"pareto_k": NUMBER, "ess": POSITIVE, "shares": {EACH: [SHARES]}},
     "alternatives?": [_ALTERNATIVE],
     "alternatives_failed?": TEXT,
     "standard_errors?": {EACH: [OPTIONAL]},
     "modes?": {"weights?": [FINITE]},
-    "k_hat?": FINITE,
-    "effective_draws?": FINITE,
+    "pareto_k?": FINITE,
+    "ess?": FINITE,
     "auto?": {"tolerance": FINITE, "met": FLAG, "chosen": TEXT, "steps": [_STEP]},
 }
 
@@ -376,7 +406,7 @@ LEDGER = Group(
 _OF_ACCURACY = {
     **dict.fromkeys(("mean_error", "sd_error", "low_error", "high_error"), (*_ROW, *_PARAMETER)),
     "wasserstein": (*_ROW, *_PARAMETER),
-    **dict.fromkeys(("method", "override", "problems", "r_hat", "k_hat", "effective_draws"), _ROW),
+    **dict.fromkeys(("method", "override", "problems", "r_hat", "pareto_k", "ess"), _ROW),
     **dict.fromkeys(("gradients", "densities", "seconds_first", "seconds_again"), _ROW),
     "peak_memory": _ROW,
     "parameter": _PARAMETER,
@@ -389,7 +419,7 @@ ACCURACY = Group(
     attributes={
         "reference": TEXT,
         "reference_draws": COUNT,
-        "reference_effective_draws": FINITE,
+        "reference_ess": FINITE,
         "reference_error": FINITE,
         "reference_doubts": TEXT,
     },

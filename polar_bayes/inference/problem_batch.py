@@ -59,8 +59,8 @@ class BatchDraws(NamedTuple):
     status: np.ndarray | Status
     draws: Values = {}
     weights: np.ndarray = np.empty((0, 0))
-    effective_draws: np.ndarray | float = np.nan
-    approach: np.ndarray | MethodUsed = MethodUsed.NONE
+    ess: np.ndarray | float = np.nan
+    method: np.ndarray | MethodUsed = MethodUsed.NONE
     pareto_k: np.ndarray | float = np.nan
     condition: AnyArray | float = np.nan
     steps: np.ndarray | int = 0
@@ -74,16 +74,16 @@ class Outcome(NamedTuple):
     """
 
     pareto_k: np.ndarray
-    effective_draws: np.ndarray
+    ess: np.ndarray
     condition: np.ndarray
     steps: np.ndarray
-    approach: np.ndarray
+    method: np.ndarray
     status: np.ndarray
 
     def put(self, found: BatchDraws) -> None:
         """Enter what was found for some captures."""
         at = found.at
-        self.effective_draws[at], self.approach[at] = found.effective_draws, found.approach
+        self.ess[at], self.method[at] = found.ess, found.method
         self.status[at] = found.status
         self.steps[at] += found.steps
         for own, new in ((self.pareto_k, found.pareto_k), (self.condition, found.condition)):
@@ -94,10 +94,10 @@ def empty_outcome(count: int, status: Status = Status.NOT_CONVERGED) -> Outcome:
     """Diagnostics of captures that are not fitted yet."""
     return Outcome(
         pareto_k=np.full(count, np.nan),
-        effective_draws=np.full(count, np.nan),
+        ess=np.full(count, np.nan),
         condition=np.full(count, np.nan),
         steps=np.zeros(count, np.int32),
-        approach=np.full(count, MethodUsed.NONE, np.int8),
+        method=np.full(count, MethodUsed.NONE, np.int8),
         status=np.full(count, status, np.int8),
     )
 

@@ -49,10 +49,10 @@ BLOCK = 4096
 
 DIAGNOSTICS = {
     "pareto_k": "Pareto k of the importance weights",
-    "effective_draws": "effective sample size of the draws",
+    "ess": "effective sample size of the draws",
     "condition": "condition number of the curvature at the mode",
     "steps": "steps to the mode",
-    "approach": "method by which the numbers were found",
+    "method": "method by which the numbers were found",
     "status": "status of the pixel",
 }
 
@@ -109,7 +109,7 @@ def fit_pixels(
         For each parameter its mean `<name>`, `<name>_sd` and `<name>_quantile`, each (y, x, ...);
         what is shared has no map, and is told by `maps.shared_parameters`; `<name>_slope` is the
         change of the mean with one standard deviation of each shared parameter;
-        `pareto_k`, `effective_draws`, `condition`, `steps`, `approach` (the method by which the
+        `pareto_k`, `ess`, `condition`, `steps`, `method` (the method by which the
         numbers were found) and `status` of each pixel; `criticism`, the checks in which its
         readings speak against the model (`maps.count_criticism`). NaN where a pixel has no answer;
         the attribute `polar_bayes` holds the provenance.
@@ -469,7 +469,7 @@ def maps_of(
             whole = values.reshape(*values.shape[: len(first)], *shape, *sizes)
             labels = {"units": unit, "long_name": f"{statistic} {meaning}", "symbol": symbol}
             variables[f"{name}{ending}"] = ((*first, *IMAGE, *own), np.float32(whole), labels)
-    kinds: dict[str, type[enum.IntEnum]] = {"approach": MethodUsed, "status": Status}
+    kinds: dict[str, type[enum.IntEnum]] = {"method": MethodUsed, "status": Status}
     for name, meaning in DIAGNOSTICS.items():
         attrs: dict[str, object] = {"units": "1", "long_name": meaning}
         if name in kinds:

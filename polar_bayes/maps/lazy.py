@@ -15,6 +15,7 @@ from xarray.core import indexing
 from polar_bayes.capture.files import load_capture
 from polar_bayes.errors import CaptureError, FitError, PolarBayesError
 from polar_bayes.inference.batching import IMAGE, Status, cut
+from polar_bayes.inference.files import in_present_names
 from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.numerics.psis import LEVELS
 from polar_bayes.observation.data import READINGS
@@ -96,7 +97,7 @@ def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
     where = str(store)
     if not store.is_dir():
         raise FitError("there is no such store", where=where, hint="check the path")
-    maps = _open_store(store, FitError, "make the map again")
+    maps = in_present_names(_open_store(store, FitError, "make the map again"))
     if PROVENANCE not in maps.attrs or "status" not in maps:
         raise FitError("it holds no maps", where=where, hint="give what `polar-bayes map` wrote")
     if REQUEST in maps.attrs and FINISHED not in maps.attrs:
@@ -115,7 +116,7 @@ def _check_maps(maps: xr.Dataset, store: Path) -> None:
     if "quantile" in maps.dims and not np.array_equal(maps["quantile"], LEVELS):
         raise FitError("its levels are not those of a map", where=f"{store}: quantile", hint=COPY)
     for name, variable in maps.variables.items():
-        where, is_flag = f"{store}: {name}", name in ("status", "approach", "criticism")
+        where, is_flag = f"{store}: {name}", name in ("status", "method", "criticism")
         if variable.dtype.kind not in ("iu" if is_flag else "iufUOT"):
             what = f"it holds {variable.dtype.name}, which no map does"
             raise FitError(what, where=where, hint=COPY)

@@ -45,7 +45,7 @@ class Auto(AbstractMethod):
     """The cheapest method whose own diagnostics say that it is good enough.
 
     Methods are tried from cheap to exact: importance (of one material in one color), NUTS. One is
-    taken when Pareto k-hat is at most 0.7, R-hat at most 1.01, nothing diverged, no mode was left
+    taken when Pareto k is at most 0.7, R-hat at most 1.01, nothing diverged, no mode was left
     out, and the Monte Carlo error of every mean and standard deviation is within the tolerance (but
     in 1% of the fits). Where only that is missing, the same method is tried once more with more
     draws.
@@ -85,7 +85,7 @@ class Auto(AbstractMethod):
             Methods by name.
         """
         needed = draws_needed(self.tolerance, int(problem.describe()["size"].sum()))
-        chains = Nuts(effective_draws=max(450.0, float(needed)), most_draws=max(4000, 4 * needed))
+        chains = Nuts(ess=max(450.0, float(needed)), most_draws=max(4000, 4 * needed))
         if not problem.is_one_spectrum_point:
             return {"nuts": chains}
         weighted = Importance(draws=max(2048, 2 * min(RESERVE * needed, MOST_DRAWS)), rounds=1)
@@ -170,8 +170,8 @@ class Auto(AbstractMethod):
             monte_carlo=error,
             taken=not doubts,
             r_hat=draws.r_hat,
-            k_hat=draws.k_hat,
-            effective_draws=draws.effective_draws,
+            pareto_k=draws.pareto_k,
+            ess=draws.ess,
         )
 
     def _report(
@@ -207,12 +207,12 @@ class Attempt(NamedTuple):
     monte_carlo: float = np.inf
     taken: bool = False
     r_hat: float = np.nan
-    k_hat: float = np.nan
-    effective_draws: float = np.nan
+    pareto_k: float = np.nan
+    ess: float = np.nan
 
     def as_metadata(self) -> Provenance:
         """What JSON can hold."""
-        numbers = ("seconds", "monte_carlo", "r_hat", "k_hat", "effective_draws")
+        numbers = ("seconds", "monte_carlo", "r_hat", "pareto_k", "ess")
         texts = {"name": self.name, "taken": self.taken, "why": self.why}
         return texts | {name: _rounded(getattr(self, name)) for name in numbers}
 
@@ -220,8 +220,8 @@ class Attempt(NamedTuple):
 def _bias_doubts(draws: PosteriorDraws, problem: Problem) -> list[str]:
     """Why draws may be biased."""
     doubts = draws.doubts
-    if draws.k_hat > MAX_PARETO_K and not doubts:
-        doubts.append(f"its Pareto k-hat is {draws.k_hat:.2f}")
+    if draws.pareto_k > MAX_PARETO_K and not doubts:
+        doubts.append(f"its Pareto k is {draws.pareto_k:.2f}")
     if draws.r_hat > LARGEST_R_HAT:
         doubts.append(f"its R-hat is {draws.r_hat:.3f}")
     # Where all chains began at one mode, R-hat cannot see the others.

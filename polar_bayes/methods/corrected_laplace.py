@@ -40,7 +40,7 @@ from polar_bayes.numerics.mixtures import (
     random_rotations,
     student_t_points,
 )
-from polar_bayes.numerics.psis import MAX_PARETO_K, effective_draws, smooth
+from polar_bayes.numerics.psis import MAX_PARETO_K, smooth, weighted_ess
 from polar_bayes.observation.data import Observations
 
 HARD = 1024
@@ -168,7 +168,7 @@ class Approximation(NamedTuple):
     @property
     def is_trusted(self) -> np.ndarray:
         """Whether the weights correct the errors of the approximation, (pixel,)."""
-        enough = effective_draws(self.weights) >= NORMAL_SHARE * self.weights.shape[1]
+        enough = weighted_ess(self.weights) >= NORMAL_SHARE * self.weights.shape[1]
         return self.search.converged & (self.pareto_k <= MAX_PARETO_K) & enough
 
     @property
@@ -261,7 +261,7 @@ class _Run:
             found.parameters,
             # Weights that cannot be trusted do not correct anything.
             np.where(trusted[:, None], found.weights, 1.0 / self.settings.draws),
-            np.where(trusted, effective_draws(found.weights), np.nan),
+            np.where(trusted, weighted_ess(found.weights), np.nan),
             np.where(trusted, MethodUsed.IMPORTANCE, MethodUsed.LAPLACE),
             found.pareto_k,
             mode.condition,
@@ -286,7 +286,7 @@ class _Run:
             ]
             parameters, ratios = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *parts)
             weights, pareto_k = smooth(ratios)
-            effective = effective_draws(weights)
+            effective = weighted_ess(weights)
             least = STUDENT_T_SHARE * weights.shape[1]
             enough = (pareto_k <= MAX_PARETO_K) & (effective >= least)
             if self.settings.sampler is not None and enough.any():

@@ -55,10 +55,10 @@ from polar_bayes.numerics.optimize import finite_sd
 from polar_bayes.numerics.psis import (
     FINITE_VARIANCE,
     MAX_PARETO_K,
-    effective_draws,
     numpy_generator,
     smooth,
     systematic_resample,
+    weighted_ess,
 )
 from polar_bayes.observation.data import Observations
 from polar_bayes.progress import Progress, no_progress
@@ -78,7 +78,7 @@ class Importance(AbstractMethod):
     Draws come from a mixture of Student t distributions with 8 degrees of freedom, at each mode
     that holds 0.1% of the Laplace evidence or more and along the profiles of every coordinate
     through it, each as heavy as the square root of its evidence. Weighting them by the posterior
-    corrects what the normal approximation gets wrong, as far as the mixture reaches; Pareto k-hat
+    corrects what the normal approximation gets wrong, as far as the mixture reaches; Pareto k
     says how far. In further rounds a mixture that is fitted to the weighted draws of all rounds
     before proposes as many draws again, until there are enough effective ones and their weights
     have a finite variance.
@@ -112,7 +112,7 @@ class Importance(AbstractMethod):
         while sample.is_open:
             sample.weigh(coordinates.log_density(sample.draw()))
             progress("weighting draws", len(sample.proposals) / self.rounds)
-        weights, k_hat, effective = sample.weights, sample.k_hat, sample.effective
+        weights, pareto_k, effective = sample.weights, sample.pareto_k, sample.effective
         if not np.isfinite(weights).all():
             raise FitError(
                 "the posterior density is zero at every draw",
@@ -122,9 +122,9 @@ class Importance(AbstractMethod):
         z = coordinates.forward(sample.z)
         index = systematic_resample(weights, effective, numpy_generator(key_resample))
         problems = []
-        if not k_hat <= MAX_PARETO_K:
+        if not pareto_k <= MAX_PARETO_K:
             problems.append(
-                f"Pareto k-hat of the weights is {k_hat:.2f} (at most {MAX_PARETO_K}): they do "
+                f"Pareto k of the weights is {pareto_k:.2f} (at most {MAX_PARETO_K}): they do "
                 "not reach all of the posterior, so use method='nuts'"
             )
         return PosteriorDraws(
@@ -133,8 +133,8 @@ class Importance(AbstractMethod):
             stats={"lp": sample.log_posterior[index]},
             problems=problems,
             weighted=(z, weights),
-            k_hat=k_hat,
-            effective_draws=effective,
+            pareto_k=pareto_k,
+            ess=effective,
             gradients=float(initialization.metadata["gradients"]),
             densities=float(len(z)),
             metadata={"modes": initialization.metadata},
@@ -211,7 +211,7 @@ def tail_shares(problem: Problem, parameters: Values, key: Array) -> Provenance:
         low, high = np.quantile(np.reshape(parameters[name], (-1, draws.shape[1])), CENTRAL_95, 0)
         beyond = np.stack([weights @ (draws < low), weights @ (draws > high)], axis=1)
         shares[name] = np.round(beyond, 5).tolist()
-    known = {"k_hat": found.k_hat, "effective_draws": found.effective_draws}
+    known = {"pareto_k": found.pareto_k, "ess": found.ess}
     return {"tails": {**known, "shares": shares}}
 
 
@@ -275,10 +275,10 @@ class Rounds:
         self._parameters.append(parameters or {})
         mean = scipy.special.logsumexp(self._log_proposals, axis=0) - math.log(len(self.proposals))
         log_ratios = self.log_posterior - mean
-        weights, k_hat = smooth(log_ratios[None])
-        self.weights, self.k_hat = weights[0], float(k_hat[0])
-        self.effective = float(effective_draws(weights)[0])
-        enough = self.effective >= ENOUGH_SHARE * self._draws and self.k_hat <= FINITE_VARIANCE
+        weights, pareto_k = smooth(log_ratios[None])
+        self.weights, self.pareto_k = weights[0], float(pareto_k[0])
+        self.effective = float(weighted_ess(weights)[0])
+        enough = self.effective >= ENOUGH_SHARE * self._draws and self.pareto_k <= FINITE_VARIANCE
         is_last = enough or len(self.proposals) == self._rounds
         self._next = None if is_last or not self.is_finite else self._fit(log_ratios)
 
@@ -290,15 +290,15 @@ class Rounds:
     def answer(self, at: np.ndarray, mode: tuple[AnyArray, AnyArray]) -> BatchDraws:
         """All draws as those of the capture at one place of a batch."""
         if not self.is_finite:
-            return BatchDraws(at, Status.NOT_CONVERGED, pareto_k=self.k_hat, mode=mode)
+            return BatchDraws(at, Status.NOT_CONVERGED, pareto_k=self.pareto_k, mode=mode)
         return BatchDraws(
             at,
-            Status.GOOD if self.k_hat <= MAX_PARETO_K else Status.NOT_TRUSTED,
+            Status.GOOD if self.pareto_k <= MAX_PARETO_K else Status.NOT_TRUSTED,
             jax.tree.map(lambda *rows: np.concatenate(rows)[None], *self._parameters),
             self.weights[None],
             self.effective,
             MethodUsed.IMPORTANCE,
-            self.k_hat,
+            self.pareto_k,
             mode=mode,
         )
 
@@ -333,7 +333,7 @@ def _temper(log_ratios: np.ndarray, least: float) -> np.ndarray:
         return raised / raised.sum()
 
     def excess(power: float) -> float:
-        return float(effective_draws(weights(power)[None])[0]) - least
+        return float(weighted_ess(weights(power)[None])[0]) - least
 
     if excess(1.0) >= 0.0 or excess(1e-6) <= 0.0:
         return weights(1.0)

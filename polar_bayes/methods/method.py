@@ -48,8 +48,8 @@ class PosteriorDraws:
         covariance: Of a point estimate, whose one draw is the estimate: covariance of `z`, shape
             (size, size), infinite where the readings do not determine it.
         r_hat: Largest R-hat of all coordinates; NaN where there are no chains.
-        k_hat: Pareto k-hat of the importance weights; NaN where there are none.
-        effective_draws: Effective sample size, the smallest of all coordinates.
+        pareto_k: Pareto k of the importance weights; NaN where there are none.
+        ess: Effective sample size, the smallest of all coordinates.
         gradients: Evaluations of the log density with its gradient.
         densities: Evaluations of the log density alone.
         metadata: Anything that JSON can hold and the result should keep, by name.
@@ -62,8 +62,8 @@ class PosteriorDraws:
     weighted: tuple[np.ndarray, np.ndarray] | None = None
     covariance: np.ndarray | None = None
     r_hat: float = np.nan
-    k_hat: float = np.nan
-    effective_draws: float = np.nan
+    pareto_k: float = np.nan
+    ess: float = np.nan
     gradients: float = np.nan
     densities: float = np.nan
     metadata: Provenance = dataclasses.field(default_factory=dict)
@@ -290,15 +290,15 @@ class AbstractMethod(AbstractBatchMethod):
             if not finite_draws(parameters).any():
                 return None
             judged = assess_draws(draws, parameters)
-            thinned = thin_draws(parameters, judged.effective_draws)
+            thinned = thin_draws(parameters, judged.ess)
             count = len(next(iter(thinned.values())))
             return BatchDraws(
                 batch.at[[row]],
                 judged.status,
                 {name: x[None] for name, x in thinned.items()},
                 np.full((1, count), 1.0 / count),
-                judged.effective_draws,
-                judged.approach,
+                judged.ess,
+                judged.method,
                 judged.pareto_k,
             )
 
@@ -308,9 +308,9 @@ class AbstractMethod(AbstractBatchMethod):
 class Assessment(NamedTuple):
     """Of one fit, as `Outcome` has it of many."""
 
-    effective_draws: float
+    ess: float
     pareto_k: float
-    approach: MethodUsed
+    method: MethodUsed
     status: Status
 
 
@@ -318,14 +318,14 @@ def assess_draws(draws: PosteriorDraws, parameters: Values) -> Assessment:
     """Status and effective sample size of one fit."""
     finite = finite_draws(parameters)
     good, effective = not draws.doubts and bool(finite.all()), float(finite.sum())
-    approach = MethodUsed.__members__.get(draws.method.upper(), MethodUsed.OTHER)
-    if "diverging" in draws.stats or approach == MethodUsed.OTHER:  # a user's draws may be chains
+    method = MethodUsed.__members__.get(draws.method.upper(), MethodUsed.OTHER)
+    if "diverging" in draws.stats or method == MethodUsed.OTHER:  # a user's draws may be chains
         bulk, tail, r_hat = measure(flatten(parameters))
         mixed = min(bulk.min(), tail.min()) >= SMALLEST_ESS and r_hat.max() <= LARGEST_R_HAT
         good = good and bool(mixed and draws.metadata.get("goals_reached", True))
         effective = float(np.nan_to_num(bulk.min(), nan=1.0))
     status = Status.GOOD if good else Status.NOT_TRUSTED
-    return Assessment(effective, draws.k_hat, approach, status)
+    return Assessment(effective, draws.pareto_k, method, status)
 
 
 def thin_draws(parameters: Values, effective: float) -> dict[str, np.ndarray]:

@@ -48,7 +48,7 @@ class Nuts(AbstractMethod):
             whose metric is known before.
         draws: Draws kept at least, per chain.
         most_draws: Draws kept at most, per chain; set it to `draws` for a fixed length.
-        effective_draws: Goal for the bulk and tail effective sample size of every coordinate.
+        ess: Goal for the bulk and tail effective sample size of every coordinate.
         target_acceptance: Higher means smaller steps, range [0.5, 1). None: 0.9 for one material,
             0.98 for a few patches, 0.7 for many, whose coordinates are close to normal.
         max_tree_depth: A trajectory has at most 2 ** this steps.
@@ -66,7 +66,7 @@ class Nuts(AbstractMethod):
     warmup: int | None = None
     draws: int = 500
     most_draws: int = 8000
-    effective_draws: float = 450.0
+    ess: float = 450.0
     target_acceptance: float | None = None
     max_tree_depth: int = 8
     threads: int = 2
@@ -99,7 +99,7 @@ class Nuts(AbstractMethod):
             z=z,
             stats=stats,
             r_hat=float(np.max(r_hat)),
-            effective_draws=float(min(np.min(bulk), np.min(tail))),
+            ess=float(min(np.min(bulk), np.min(tail))),
             gradients=search + float(warmup + np.sum(stats["n_steps"])),
             densities=0.0,
             metadata={
@@ -125,8 +125,8 @@ class Nuts(AbstractMethod):
         # Half the effective draws: the ends of an interval then move by a tenth of a sd.
         least = max(self.draws // 2, 50)
         most = max(self.most_draws // 4, least)
-        half = 0.5 * self.effective_draws
-        chains = dataclasses.replace(self, draws=least, most_draws=most, effective_draws=half)
+        half = 0.5 * self.ess
+        chains = dataclasses.replace(self, draws=least, most_draws=most, ess=half)
         return (ONE_ROUND, chains) if suits_profiles(problem) else (chains,)
 
     @override
@@ -153,7 +153,7 @@ class Nuts(AbstractMethod):
         scaled = {
             name: int(np.ceil(factor * getattr(self, name))) for name in ("draws", "most_draws")
         }
-        return dataclasses.replace(self, effective_draws=factor * self.effective_draws, **scaled)
+        return dataclasses.replace(self, ess=factor * self.ess, **scaled)
 
     @override
     def run_batch(self, batch: ProblemBatch) -> Iterator[BatchDraws]:
@@ -268,7 +268,7 @@ def _converged(rounds: list[Step], settings: Nuts) -> bool:
     z = np.asarray(_stacked(rounds).z)
     bulk, tail, r_hat = measure(np.moveaxis(z, -1, 0))
     smallest = min(bulk.min(), tail.min())
-    return bool(smallest >= settings.effective_draws and r_hat.max() <= LARGEST_R_HAT)
+    return bool(smallest >= settings.ess and r_hat.max() <= LARGEST_R_HAT)
 
 
 class Static(NamedTuple):

@@ -120,7 +120,7 @@ def summarize(
         # One more draw of the same distribution lies below the k-th of n with probability k/(n+1):
         # intervals between quasi-random positions, (k-1/2)/n, hold too few.
         # Source: Hyndman & Fan (1996), Am. Stat. 50(4), 361-365, definition 6.
-        count = effective_draws(weights)[:, None]
+        count = weighted_ess(weights)[:, None]
         below = (count * below + 0.5) / (count + 1.0)
     return mean, sd, np.stack([_interpolate(level, below, ranked) for level in levels])
 
@@ -136,7 +136,7 @@ def _interpolate(level: float, below: np.ndarray, ranked: np.ndarray) -> np.ndar
     return x0 + np.where(p1 > p0, between, 0.0) * (x1 - x0)
 
 
-def effective_draws(weights: Float[np.ndarray, "pixel draw"]) -> Float[np.ndarray, " pixel"]:
+def weighted_ess(weights: Float[np.ndarray, "pixel draw"]) -> Float[np.ndarray, " pixel"]:
     """Effective sample size of weighted draws (Kish), as a number of independent draws."""
     return 1.0 / np.sum(weights**2, axis=-1)
 

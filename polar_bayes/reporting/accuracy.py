@@ -205,8 +205,8 @@ def study_table(study: AccuracyView) -> Table:
         "interval": column("interval", ".2g"),
         "Wasserstein": column("wasserstein", ".2g"),
         "R-hat": column("r_hat", ".3f"),
-        "k-hat": column("k_hat", ".2f"),
-        "ESS": column("effective_draws", ",.0f"),
+        "Pareto k": column("pareto_k", ".2f"),
+        "ESS": column("ess", ",.0f"),
         "gradients": column("gradients", ",.0f"),
         "densities": column("densities", ",.0f"),
     }

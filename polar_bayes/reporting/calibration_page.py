@@ -258,12 +258,12 @@ def _readings(
 
 
 def _fit_tables(calibration: xr.DataTree, ranks: Mapping[str, Ranks]) -> Iterator[Table]:
-    """Numbers of fits by status and by approach."""
+    """Numbers of fits by status and by method."""
     fits = calibration["fits"].to_dataset()
     answered = np.all([np.isfinite(each.pit) for each in ranks.values()], axis=0)
     tables: dict[str, tuple[type[enum.IntEnum], Mapping[str, str]]] = {
         "status": (Status, STATUSES),
-        "approach": (MethodUsed, text.APPROACHES),
+        "method": (MethodUsed, text.METHODS_USED),
     }
     for name, (known, meanings) in tables.items():
         if name not in fits:
@@ -283,8 +283,8 @@ def _fit_facts(calibration: xr.DataTree) -> dict[str, str]:
     """Effective sample sizes of the fits, and how far they can be trusted."""
     fits = calibration["fits"].to_dataset()
     facts = {}
-    if "effective_draws" in fits:
-        draws = fits["effective_draws"].to_numpy()
+    if "ess" in fits:
+        draws = fits["ess"].to_numpy()
         draws = draws[np.isfinite(draws)]
         if draws.size:
             low, middle = np.quantile(draws, [0.05, 0.5])

@@ -516,12 +516,12 @@ def _sampler_facts(fit: FitView) -> dict[str, object]:
         for name, (title, describe) in SAMPLER_FACTS.items()
         if name in stats
     }
-    k_hat = fit.provenance.get("k_hat")
+    pareto_k = fit.provenance.get("pareto_k")
     if fit.method in APPROXIMATIONS and "log_weight" in stats:
-        k_hat = convergence.laplace_k_hat(fit)
-    if k_hat is not None:
-        facts[f"Pareto k-hat (at most {MAX_PARETO_K})"] = or_dash(k_hat, ".2f")
-    if (effective := fit.provenance.get("effective_draws")) is not None:
+        pareto_k = convergence.laplace_pareto_k(fit)
+    if pareto_k is not None:
+        facts[f"Pareto k (at most {MAX_PARETO_K})"] = or_dash(pareto_k, ".2f")
+    if (effective := fit.provenance.get("ess")) is not None:
         facts["effective sample size of the draws"] = f"{effective:.0f}"
     if modes.get("weights"):
         facts["weights of the modes found"] = [f"{weight:.3g}" for weight in modes["weights"]]

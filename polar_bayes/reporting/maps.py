@@ -34,7 +34,7 @@ from polar_bayes.physics.part import notation
 from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.fit_page import INSTRUMENT_GROUP, provenance_facts
 from polar_bayes.reporting.style import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
-from polar_bayes.reporting.text import APPROACHES, DASH, SLIGHT, count_percent, number
+from polar_bayes.reporting.text import DASH, METHODS_USED, SLIGHT, count_percent, number
 from polar_bayes.repr_html import Row, Table
 
 STATUSES = {
@@ -42,7 +42,7 @@ STATUSES = {
     "masked": "no valid reading",
     "too few views": f"fewer than {MIN_VIEWS} valid views",
     "not converged": "no answer was reached; NaN",
-    "not trusted": "numbers that no check confirms, by the approach in the next table",
+    "not trusted": "numbers that no check confirms, by the method in the next table",
     "contradicted": "numbers of a good posterior, whose model the readings contradict",
     "not fitted": "called good without finite numbers, or never written",
 }
@@ -70,7 +70,7 @@ STATUS_COLORS = {
 
 @style.styled
 def plot_maps(maps: xr.Dataset, *, wavelength: float | None = None) -> Figure:
-    """Means, widths of the 95% intervals, Pareto k, approach and status of a map.
+    """Means, widths of the 95% intervals, Pareto k, method and status of a map.
 
     Args:
         maps: Of `polar_bayes.fit_pixels`, or opened from a store.
@@ -107,7 +107,7 @@ def plot_maps(maps: xr.Dataset, *, wavelength: float | None = None) -> Figure:
         _draw_values(panel(0, at), shown[name], title, "viridis")
         _draw_values(panel(1, at), high - low, "95% width", "cividis")
     _draw_values(panel(2, 0), shown["pareto_k"], "Pareto k", "magma", limits=(0.0, 1.0))
-    _draw_flags(panel(2, 1), shown["approach"], (NO_ANSWER, SKY, BLUE, GREEN, ORANGE, PURPLE))
+    _draw_flags(panel(2, 1), shown["method"], (NO_ANSWER, SKY, BLUE, GREEN, ORANGE, PURPLE))
     status = checked_status(shown)
     colors = [STATUS_COLORS.get(each, NO_ANSWER) for each in flag_meanings(status).values()]
     _draw_flags(panel(2, 2), status, colors)
@@ -198,19 +198,19 @@ def flag_indices(flags: xr.DataArray, meanings: Mapping[int, str]) -> np.ndarray
 
 
 def count_cases(maps: xr.Dataset) -> pd.DataFrame:
-    """Numbers of pixels by status (rows) and approach (columns)."""
-    rows, columns = (flag_meanings(maps[name]) for name in ("status", "approach"))
+    """Numbers of pixels by status (rows) and method (columns)."""
+    rows, columns = (flag_meanings(maps[name]) for name in ("status", "method"))
     counts = np.zeros((len(rows), len(columns)), int)
     for place in cut(maps, CHUNK):
         block = maps.isel(place)
         status = flag_indices(checked_status(block), rows)
-        np.add.at(counts, (status, flag_indices(block["approach"], columns)), 1)
+        np.add.at(counts, (status, flag_indices(block["method"], columns)), 1)
     return pd.DataFrame(counts, index=list(rows.values()), columns=list(columns.values()))
 
 
 # --- The page -------------------------------------------------------------------------------------
 
-TRUST = ("pareto_k", "approach", "status")
+TRUST = ("pareto_k", "method", "status")
 UNCHECKED = "laplace"
 """The method whose draws nothing checks in a map."""
 
@@ -338,11 +338,11 @@ def _wavelengths(maps: xr.Dataset) -> list[float]:
 
 
 def _pixel_tables(counts: pd.DataFrame) -> Iterator[Table]:
-    """Pixels by status; and by approach, with how many of them are good."""
+    """Pixels by status; and by method, with how many of them are good."""
     yield count_table("map.status", counts.sum(axis=1).to_frame("pixels"), STATUSES)
     good = counts.loc["good"] if "good" in counts.index else 0 * counts.sum()
     data = pd.DataFrame({"pixels": counts.sum(), "good": good})
-    yield count_table("map.approach", data, APPROACHES)
+    yield count_table("map.method", data, METHODS_USED)
 
 
 def _criticism_table(maps: xr.Dataset) -> Iterator[Table]:

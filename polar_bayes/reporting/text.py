@@ -473,7 +473,7 @@ def _disagreements(table: pd.DataFrame) -> list[str]:
 SLIGHT = 0.01
 """A smaller error of the coverage gives no warning, however many pixels show it."""
 
-APPROACHES = {
+METHODS_USED = {
     "none": "no numbers",
     "laplace": "the normal approximation as it is",
     "importance": "weighted draws of normal approximations",
@@ -511,7 +511,7 @@ def pixel_sentences(counts: pd.DataFrame) -> list[str]:
     if good:
         by = {str(way): int(number) for way, number in counts.loc["good"].items() if number}
         ways = [
-            f"{'all' if len(by) == 1 else format(number, ',')} by {APPROACHES.get(way, way)}"
+            f"{'all' if len(by) == 1 else format(number, ',')} by {METHODS_USED.get(way, way)}"
             for way, number in by.items()
         ]
         sentences.append(
@@ -636,7 +636,7 @@ def reference_sentence(result: Study) -> str:
     study = view.study.attrs
     sentence = (
         f"The reference is {study['reference_draws']:,} draws of {study['reference']} with an "
-        f"effective sample size of {study['reference_effective_draws']:,.0f}; its own Monte Carlo "
+        f"effective sample size of {study['reference_ess']:,.0f}; its own Monte Carlo "
         f"error is at most {study['reference_error']:.2g} posterior sd."
     )
     return f"{sentence} Against it speaks: {view.doubts}." if view.doubts else sentence

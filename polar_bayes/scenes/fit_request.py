@@ -34,7 +34,7 @@ from polar_bayes.scenes.neighbors import STOPPED, fit_comparisons, removed_terms
 
 PRIOR_DRAWS = 500
 
-DIAGNOSTICS = ("r_hat", "k_hat", "effective_draws")
+DIAGNOSTICS = ("r_hat", "pareto_k", "ess")
 """What a method states of its own draws, stored with the result; None where it states nothing."""
 
 Keep = Callable[[xr.DataTree], None]

@@ -114,7 +114,7 @@ def _first_trusted(
     for method in methods[:-1]:
         with contextlib.suppress(FitError):
             draws = method.run(problem, key, progress)
-            if not draws.doubts and draws.effective_draws >= 0.5 * SMALLEST_ESS:
+            if not draws.doubts and draws.ess >= 0.5 * SMALLEST_ESS:
                 return draws.z
     return methods[-1].run(problem, key, progress).z
 

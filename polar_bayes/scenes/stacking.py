@@ -106,8 +106,8 @@ def _add_provenance(result: xr.DataTree, **more: object) -> None:
 
 def _serves_as_chains(weighted: xr.DataTree) -> bool:
     """Whether weighted draws of a comparison converged, with weights of finite variance."""
-    k_hat = provenance_of(weighted).get("k_hat")
-    return k_hat is not None and k_hat <= FINITE_VARIANCE and verdict(weighted).converged
+    pareto_k = provenance_of(weighted).get("pareto_k")
+    return pareto_k is not None and pareto_k <= FINITE_VARIANCE and verdict(weighted).converged
 
 
 def stack_fits(fits: Mapping[str, xr.DataTree], weights: Mapping[str, float]) -> xr.DataTree:
@@ -176,7 +176,7 @@ def _provenance(
     """That of the heaviest scene; problems are those of all."""
     each = {name: provenance_of(tree) for name, tree in trees.items()}
     found = dict(next(iter(each.values())))
-    for key in ("modes", "k_hat"):
+    for key in ("modes", "pareto_k"):
         found.pop(key, None)
     for key in BY_PARAMETER:
         found[key] = {n: x for n, x in (found.get(key) or {}).items() if n in shared}

@@ -48,7 +48,7 @@ class Biased(AbstractMethod):
         sd = np.sqrt(np.diagonal(covariance))
         random = np.random.default_rng(0)
         z = random.multivariate_normal(mean + self.shift * sd, covariance, (4, self.draws // 4))
-        return PosteriorDraws("variational", z, {}, k_hat=0.6, effective_draws=float(self.draws))
+        return PosteriorDraws("variational", z, {}, pareto_k=0.6, ess=float(self.draws))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,7 +128,7 @@ def test_the_reference_states_its_own_error(study):
     assert 0.0 < told["reference_error"] < 0.05
     assert told["reference_r_hat"] < 1.01
     assert told["reference_doubts"] == ""
-    assert told["reference_effective_draws"] > 400
+    assert told["reference_ess"] > 400
 
 
 def test_a_method_that_fails_is_a_row_that_says_why(study):
@@ -170,7 +170,7 @@ def test_dials_turn_what_they_can_and_leave_the_rest_out(study):
     assert ("broken", "draws / 10") not in pairs  # it has no draws
     assert ("right", "single precision") in pairs
     table = pb.summary(study)
-    assert table.loc["right, draws / 10", "effective_draws"] == 400
+    assert table.loc["right, draws / 10", "ess"] == 400
 
 
 @pytest.mark.thorough

@@ -91,7 +91,7 @@ def test_the_tree_holds_every_fit(corrected: xr.DataTree) -> None:
     assert set(corrected.children) == {"prior_sbc", "truth", "marginals", "fits"} | ranked
     assert dict(corrected["prior_sbc"].sizes) == {"simulation": COUNT}
     fits = corrected["fits"].to_dataset()
-    assert set(fits.data_vars) >= {"status", "approach", "pareto_k", "effective_draws", "steps"}
+    assert set(fits.data_vars) >= {"status", "method", "pareto_k", "ess", "steps"}
     pit = corrected["prior_sbc"]["refractive_index"]
     assert float(pit.min()) > 0.0
     assert float(pit.max()) < 1.0

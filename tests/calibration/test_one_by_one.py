@@ -83,7 +83,7 @@ def test_an_exact_method_passes_patch_by_patch(exact: xr.DataTree) -> None:
         assert np.abs(table[f"held_{percent}"] - share).max() < 3.3 * error
     assert exact["truth"]["level"].dims == ("simulation", "patch")
     assert (exact["fits"]["status"] == Status.GOOD).all()
-    assert (exact["fits"]["approach"] == MethodUsed.LAPLACE).all()
+    assert (exact["fits"]["method"] == MethodUsed.LAPLACE).all()
 
 
 @pytest.mark.thorough
@@ -111,8 +111,8 @@ def test_chains_that_are_too_short_are_ranked_and_not_trusted(capture: xr.Datase
     found = pb.calibrate(capture, simulations=20, model=population, method=SHORT, **ASKED)
     fits = found["fits"].to_dataset()
     assert (fits["status"] == Status.NOT_TRUSTED).all()  # 100 draws are not worth 400
-    assert (fits["approach"] == MethodUsed.NUTS).all()
-    assert (fits["effective_draws"] < 400.0).all()
+    assert (fits["method"] == MethodUsed.NUTS).all()
+    assert (fits["ess"] < 400.0).all()
     assert np.isfinite(found["prior_sbc"]["level"]).all()
     said = pb.verdict(found).sentences
     assert "20 of 20 fits: not trusted." in said
@@ -155,7 +155,7 @@ def test_weighted_draws_of_a_discrepancy_are_made_one_after_another_in_double_pr
     """Its coordinates are not those of pixels; a warning of lost digits would be an error here."""
     capture = plate_capture(GONIOMETER_VIEWS, 0.02, seed=1)
     found = pb.calibrate(capture, simulations=20, method="importance", readings=False, **GONIOMETER)
-    assert (found["fits"]["approach"] == MethodUsed.IMPORTANCE).all()
+    assert (found["fits"]["method"] == MethodUsed.IMPORTANCE).all()
     assert np.mean(found["fits"]["status"] == Status.GOOD) > 0.5
 
 
@@ -216,8 +216,8 @@ def test_a_method_of_a_user_is_calibrated_and_judged_by_its_own_draws() -> None:
     one = plate_capture(np.linspace(35.0, 75.0, VIEWS), 0.03, 0)
     given: dict[str, Any] = {"model": line, "method": Mine(), "links": LINKS, "readings": False}
     fits = pb.calibrate(one, simulations=20, **given)["fits"].to_dataset()
-    assert (fits["approach"] == MethodUsed.OTHER).all()
+    assert (fits["method"] == MethodUsed.OTHER).all()
     assert (fits["status"] == Status.GOOD).all()
-    assert (fits["effective_draws"] < 6000.0).all()
+    assert (fits["ess"] < 6000.0).all()
     short = pb.calibrate(one, simulations=20, **given | {"method": Mine(50)})["fits"].to_dataset()
     assert (short["status"] == Status.NOT_TRUSTED).all()

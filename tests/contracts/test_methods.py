@@ -14,7 +14,7 @@ LINKS = {"q": pb.links.StokesLink()}
 METHODS = {
     "laplace": pb.methods.Laplace(draws=1000),
     "importance": pb.methods.Importance(),
-    "nuts": pb.methods.Nuts(effective_draws=2000.0),
+    "nuts": pb.methods.Nuts(ess=2000.0),
 }
 QUICK = ("laplace", "importance", "nuts")
 

@@ -13,7 +13,7 @@ from synthetic_calibrations import make_calibration
 from synthetic_results import edit_provenance, make_result, replace
 
 import polar_bayes as pb
-from polar_bayes.diagnostics.convergence import json_summary, laplace_k_hat, summary, verdict
+from polar_bayes.diagnostics.convergence import json_summary, laplace_pareto_k, summary, verdict
 from polar_bayes.diagnostics.view import view_of
 from polar_bayes.errors import FitError
 
@@ -173,7 +173,7 @@ def test_a_few_readings_at_the_edge_of_their_range_are_a_note() -> None:
 
 def test_tails_that_chains_may_have_missed_are_told() -> None:
     even = {name: [[0.025, 0.03]] for name in ("refractive_index", "roughness")}
-    tails = {"k_hat": 0.3, "effective_draws": 800.0, "shares": even}
+    tails = {"pareto_k": 0.3, "ess": 800.0, "shares": even}
     tree = make_result(wavelengths=(), draws=1000)
     assert not verdict(edit_provenance(tree, tails=tails)).cautions
     heavy = tails | {"shares": even | {"roughness": [[0.02, 0.12]]}}
@@ -182,7 +182,7 @@ def test_tails_that_chains_may_have_missed_are_told() -> None:
     assert f"roughness above {end:.3g} (12.0%)" in caution
     assert "index" not in caution
     # Weights that do not reach the posterior themselves say nothing of chains.
-    assert not verdict(edit_provenance(tree, tails=heavy | {"k_hat": 0.9})).cautions
+    assert not verdict(edit_provenance(tree, tails=heavy | {"pareto_k": 0.9})).cautions
 
 
 @pytest.mark.thorough
@@ -230,10 +230,10 @@ def test_deep_trees_are_a_note_once_they_are_many() -> None:
 
 def test_another_mode_is_no_caution_where_weighted_draws_of_it_agree_with_the_chains() -> None:
     modes = {"weights": [0.8, 0.2]}
-    tails = {"k_hat": 0.4, "effective_draws": 900.0, "shares": {}}
+    tails = {"pareto_k": 0.4, "ess": 900.0, "shares": {}}
     tree = edit_provenance(make_result(), modes=modes, tails=tails)
     assert not verdict(tree).cautions
-    unknown = edit_provenance(tree, tails=tails | {"k_hat": 0.9})
+    unknown = edit_provenance(tree, tails=tails | {"pareto_k": 0.9})
     assert "another mode, of weight 0.2" in verdict(unknown).cautions[0]
 
 
@@ -248,13 +248,13 @@ def test_k_hat_has_the_right_sign(width: float, trusted: bool) -> None:
     z = np.random.default_rng(3).normal(0.0, width, (4, 1000))
     log_weight = stats.norm.logpdf(z) - stats.norm.logpdf(z, scale=width)
     tree = laplace_tree(log_weight)
-    k_hat = laplace_k_hat(tree)
+    pareto_k = laplace_pareto_k(tree)
     # Of a normal seen through a narrower one k tends to 1 - width^2; a wider one bounds weights.
-    assert k_hat == pytest.approx(1.0 - width**2, abs=0.2) if not trusted else k_hat < 0.2
+    assert pareto_k == pytest.approx(1.0 - width**2, abs=0.2) if not trusted else pareto_k < 0.2
     judged = verdict(tree)
     assert judged.passed
     assert bool(judged.cautions) == (not trusted)
-    assert trusted or "Pareto k-hat" in judged.cautions[0]
+    assert trusted or "Pareto k" in judged.cautions[0]
 
 
 def test_a_guide_is_judged_by_its_weights_as_laplace_is() -> None:
@@ -262,7 +262,7 @@ def test_a_guide_is_judged_by_its_weights_as_laplace_is() -> None:
     tree = laplace_tree(stats.norm.logpdf(z) - stats.norm.logpdf(z, scale=0.3))
     caution, lost = verdict(edit_provenance(tree, method="variational")).cautions
     assert "Leave-one-out cannot be approximated" in lost
-    assert "Pareto k-hat of the guide's draws is" in caution
+    assert "Pareto k of the guide's draws is" in caution
     # Weights of draws that were chosen by weight are another matter.
     assert not verdict(edit_provenance(tree, method="importance")).cautions
 
@@ -278,7 +278,7 @@ def test_k_hat_of_weights_that_are_all_alike(value: float, cautious: bool) -> No
 def test_a_few_weights_of_zero_are_no_reason_to_worry() -> None:
     log_weight = np.random.default_rng(0).normal(0.0, 0.01, (4, 1000))
     log_weight[0, :3] = -np.inf
-    assert laplace_k_hat(laplace_tree(log_weight)) < 0.7
+    assert laplace_pareto_k(laplace_tree(log_weight)) < 0.7
 
 
 def test_a_point_fit_has_standard_errors_and_no_chains() -> None:
@@ -324,7 +324,7 @@ def test_what_is_no_result_is_refused(wrong: object) -> None:
 @each("method", ["importance"])
 def test_weighted_draws_have_the_floor_of_chains(method: str) -> None:
     for effective, is_enough in ((399.0, False), (401.0, True)):
-        judged = verdict(edit_provenance(make_result(method=method), effective_draws=effective))
+        judged = verdict(edit_provenance(make_result(method=method), ess=effective))
         told = "The effective sample size of the weighted draws is 399 (at least 400)"
         assert any(problem.startswith(told) for problem in judged.problems) != is_enough
         assert judged.passed == is_enough

@@ -13,6 +13,7 @@ import xarray as xr
 from cases import each
 from synthetic_accuracy import make_accuracy
 from synthetic_calibrations import make_calibration
+from synthetic_maps import make_maps
 from synthetic_results import edit_provenance, make_result, pool, replace
 from tree_mutations import ODD_ATTRIBUTES, mutate, pick
 
@@ -31,7 +32,7 @@ AUTO = {
     "met": True,
     "chosen": "nuts",
     "steps": [
-        {"name": "laplace", "taken": False, "why": "k-hat", "seconds": 1.0, "monte_carlo": None},
+        {"name": "laplace", "taken": False, "why": "Pareto k", "seconds": 1.0, "monte_carlo": None},
         {"name": "nuts", "taken": True, "why": "", "seconds": 2.0, "monte_carlo": 0.02},
     ],
 }
@@ -39,7 +40,7 @@ OTHER = {
     **{"part": "Beckmann", "alternative": "GGX", "path": "surface.distribution", "defines": []},
     **{"log_bayes_factor": -1.0, "shift": {"roughness": [0.5]}},
 }
-TAILS = {"k_hat": 0.3, "effective_draws": 500.0, "shares": {"roughness": [[0.02, 0.03]]}}
+TAILS = {"pareto_k": 0.3, "ess": 500.0, "shares": {"roughness": [[0.02, 0.03]]}}
 MANY = pool(
     edit_provenance(
         make_result(**SMALL, wavelengths=(450.0, 550.0), materials=("a", "b")),
@@ -191,8 +192,8 @@ def test_provenance_that_is_no_mapping_is_refused(odd):
             r"prior_probability.roughness\[0\]: it is 'x', not a number",
         ),
         (
-            {"tails": {**TAILS, "effective_draws": 0}},
-            "tails.effective_draws: it is 0, not a number a",
+            {"tails": {**TAILS, "ess": 0}},
+            "tails.ess: it is 0, not a number a",
         ),
         (
             {"tails": {**TAILS, "shares": {"a": [[0.1]]}}},
@@ -383,6 +384,31 @@ def test_comparisons_have_the_labels_of_the_fit():
 
 
 # --- checksums --------------------------------------------------------------------------------
+
+
+def test_a_file_of_an_earlier_version_has_the_present_names(tmp_path):
+    tails = {"k_hat": 0.4, "effective_draws": 900.0, "shares": {}}
+    stated = {"k_hat": 0.3, "tails": tails, "method_parts": "Nuts(effective_draws=900.0)"}
+    fit, calibration, study = make_result(), make_calibration(), make_accuracy()
+    fit.attrs["polar_bayes"] = json.dumps(json.loads(fit.attrs["polar_bayes"]) | stated)
+    calibration["fits"] = calibration["fits"].to_dataset().rename(method="approach")
+    table = study["accuracy"].to_dataset().rename(ess="effective_draws", pareto_k="k_hat")
+    table.attrs["reference_effective_draws"] = table.attrs.pop("reference_ess")
+    study["accuracy"].dataset = table
+    for name, old in {"fit": fit, "calibration": calibration, "study": study}.items():
+        pb.save(old, tmp_path / f"{name}.nc")
+    maps = make_maps({"roughness": np.full((2, 3), 0.2)}).rename(method="approach")
+    maps.to_zarr(tmp_path / "map.zarr", consolidated=False)
+
+    read = json.loads(pb.load(tmp_path / "fit.nc", "fit").attrs["polar_bayes"])
+    assert read["pareto_k"] == 0.3
+    assert read["method_parts"] == "Nuts(ess=900.0)"
+    assert read["tails"] == {"pareto_k": 0.4, "ess": 900.0, "shares": {}}
+    assert "method" in pb.load(tmp_path / "calibration.nc")["fits"]
+    assert "method" in pb.load(tmp_path / "map.zarr")
+    again = pb.load(tmp_path / "study.nc")["accuracy"]
+    assert {"ess", "pareto_k"} <= set(again)
+    assert "reference_ess" in again.attrs
 
 
 def test_a_file_gives_back_what_was_saved(tmp_path):

@@ -180,7 +180,7 @@ def test_a_model_of_ones_own_with_a_known_posterior(capture: xr.Dataset) -> None
 def test_laplace_says_where_it_is_not_to_be_trusted(
     capture: xr.Dataset, belief: dist.Distribution, trusted: bool
 ) -> None:
-    """Tails heavier than normal have importance weights without a variance: k-hat above 0.7."""
+    """Tails heavier than normal have importance weights without a variance: Pareto k above 0.7."""
 
     def tails(data, scene, priors, links) -> None:
         del scene, priors, links
@@ -191,7 +191,7 @@ def test_laplace_says_where_it_is_not_to_be_trusted(
     result = pb.fit(capture, model=tails, scene=PLATE, links=LINKS, method="laplace", seed=1)
     verdict = pb.verdict(result)
     assert verdict.converged  # the readings are not judged: they stand for no scene
-    assert any("k-hat" in caution for caution in verdict.cautions) != trusted
+    assert any("Pareto k" in caution for caution in verdict.cautions) != trusted
 
 
 def test_least_squares_finds_the_plate(capture: xr.Dataset) -> None:

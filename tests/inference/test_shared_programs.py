@@ -38,9 +38,7 @@ from polar_bayes.observation.data import observe
 from polar_bayes.scenes.effects import ChosenScene
 
 # The goals let chains of other readings stop at another length.
-NUTS = pb.methods.Nuts(
-    chains=2, warmup=50, draws=50, most_draws=100, block=25, effective_draws=20.0
-)
+NUTS = pb.methods.Nuts(chains=2, warmup=50, draws=50, most_draws=100, block=25, ess=20.0)
 LAPLACE = pb.methods.Laplace(draws=50, chains=2)
 COLORS = np.array([450.0, 650.0])
 

@@ -36,8 +36,8 @@ def plan(image: xr.Dataset) -> MapPlan:
 @pytest.fixture(scope="module")
 def whole(image: xr.Dataset, plan: MapPlan) -> xr.Dataset:
     maps = mapped(image, plan)
-    for approach in (MethodUsed.IMPORTANCE, MethodUsed.ADAPTED, MethodUsed.NUTS):
-        assert (maps["approach"] == approach).any(), approach
+    for method in (MethodUsed.IMPORTANCE, MethodUsed.ADAPTED, MethodUsed.NUTS):
+        assert (maps["method"] == method).any(), method
     return maps
 
 
@@ -63,7 +63,7 @@ def test_a_block_in_which_nothing_was_read_is_masked(image: xr.Dataset, plan: Ma
     nothing = with_pixel_numbers(image.assign(valid=xr.zeros_like(image["q"], bool))).isel(y=[1])
     maps = fit_block(nothing, plan)
     assert (maps["status"] == Status.MASKED).all()
-    assert (maps["approach"] == MethodUsed.NONE).all()
+    assert (maps["method"] == MethodUsed.NONE).all()
     assert all(np.isnan(maps[name]).all() for name in (*NAMES, "pareto_k"))
 
 
@@ -71,7 +71,7 @@ def test_a_block_in_which_nothing_was_read_is_masked(image: xr.Dataset, plan: Ma
 def test_a_pixel_alone_gets_the_same_bits(
     image: xr.Dataset, plan: MapPlan, whole: xr.Dataset
 ) -> None:
-    sampled = np.argwhere((whole["approach"] == MethodUsed.NUTS).values)[-1]
+    sampled = np.argwhere((whole["method"] == MethodUsed.NUTS).values)[-1]
     for y, x in ((0, 0), (2, 42), sampled):
         place = {"y": slice(y, y + 1), "x": slice(x, x + 1)}
         alone = fit_block(with_pixel_numbers(image).isel(place), plan)
@@ -142,9 +142,9 @@ def test_bad_pixels_are_told_apart_and_poison_no_neighbor(
     for (y, x), status in gone.items():
         pixel = maps.isel(y=y, x=x)
         assert pixel["status"] == status
-        assert pixel["approach"] == MethodUsed.NONE
+        assert pixel["method"] == MethodUsed.NONE
         assert pixel["steps"] == 0
-        for name in (*NAMES, "pareto_k", "effective_draws", "condition"):
+        for name in (*NAMES, "pareto_k", "ess", "condition"):
             assert np.isnan(pixel[name])
         for name in NAMES:
             assert np.isnan(pixel[f"{name}_sd"])
@@ -167,8 +167,8 @@ def test_bad_pixels_are_told_apart_and_poison_no_neighbor(
 def test_another_seed_moves_draws_not_modes(image: xr.Dataset, whole: xr.Dataset) -> None:
     few = image.isel(y=slice(1), x=slice(20))
     other = mapped(few, planned(few, SHORT, seed=1))
-    there = (other["approach"] == MethodUsed.IMPORTANCE).values
-    there &= (whole["approach"].isel(y=slice(1), x=slice(20)) == MethodUsed.IMPORTANCE).values
+    there = (other["method"] == MethodUsed.IMPORTANCE).values
+    there &= (whole["method"].isel(y=slice(1), x=slice(20)) == MethodUsed.IMPORTANCE).values
     assert there.sum() > 5
     name = NAMES[0]
     one, two = (m[name].isel(y=slice(1), x=slice(20)).values[there] for m in (whole, other))

@@ -8,7 +8,7 @@ from cases import each
 from scipy import stats
 
 from polar_bayes.numerics.mixtures import normal_points, random_rotations
-from polar_bayes.numerics.psis import effective_draws, smooth, summarize
+from polar_bayes.numerics.psis import smooth, summarize, weighted_ess
 
 
 def theirs(log_ratios: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -88,7 +88,7 @@ def test_an_exact_approximation_has_even_weights_and_no_tail(dtype: type) -> Non
     found = smooth(log_ratios)
     assert (found.pareto_k == 0.0).all()
     assert found.weights == pytest.approx(1.0 / 256, rel=256 * float(np.finfo(dtype).eps))
-    assert effective_draws(found.weights) == pytest.approx(256.0)
+    assert weighted_ess(found.weights) == pytest.approx(256.0)
 
 
 @pytest.mark.thorough
@@ -149,7 +149,7 @@ def test_weighted_draws_of_a_wide_normal_are_a_narrow_one(center: float, spread:
     grid = np.linspace(-8.0, 8.0, 4001)
     ratio = stats.norm(center, spread).pdf(grid) / stats.norm().pdf(grid)
     share = 1.0 / np.trapezoid(ratio**2 * stats.norm().pdf(grid), grid)
-    assert effective_draws(found.weights)[0] == pytest.approx(4096 * share, rel=0.02)
+    assert weighted_ess(found.weights)[0] == pytest.approx(4096 * share, rel=0.02)
 
 
 # --- the points -----------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.methods import importance
 from polar_bayes.methods.method import AbstractMethod
-from polar_bayes.reporting.text import APPROACHES
+from polar_bayes.reporting.text import METHODS_USED
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 
@@ -33,12 +33,12 @@ def weighted(image: xr.Dataset, compiled_in_haste: None) -> xr.Dataset:
 @pytest.mark.thorough
 def test_chains_in_every_pixel_make_a_map(image: xr.Dataset, weighted: xr.Dataset) -> None:
     chains = pb.fit_pixels(image.isel(y=[0], x=[0, 1]), method=pb.methods.Nuts(), **ASKED)
-    assert (chains["approach"] == MethodUsed.NUTS).all()
+    assert (chains["method"] == MethodUsed.NUTS).all()
     assert (chains["status"] == Status.GOOD).all()
     for name in NAMES:
         one, other = chains[name].values[0], weighted[name].values[0, :2]
-        worth = 1.0 / chains["effective_draws"].values[0]
-        worth += 1.0 / weighted["effective_draws"].values[0, :2]
+        worth = 1.0 / chains["ess"].values[0]
+        worth += 1.0 / weighted["ess"].values[0, :2]
         # Four standard normals, in two pairs: the largest is above 4 in 3 of ten thousand cases.
         error = weighted[f"{name}_sd"].values[0, :2] * np.sqrt(worth)
         assert (np.abs(one - other) < 4.0 * error).all()
@@ -56,13 +56,13 @@ def test_importance_sampling_makes_a_map(image: xr.Dataset, kind: type) -> None:
     some = image.isel(y=[0, 1], x=[0, 1])
     maps = pb.fit_pixels(some, method=method, **ASKED)
     assert (maps["status"] == Status.GOOD).all()
-    assert (maps["approach"] == MethodUsed.IMPORTANCE).all()
+    assert (maps["method"] == MethodUsed.IMPORTANCE).all()
     assert (maps["pareto_k"] <= 0.7).all()
     for y, x in np.ndindex(2, 2):
         truth = on_a_grid(some["q"].values[y, x], NOISE, VIEWS)
         for name in NAMES:
             mean, sd, _ = truth[name]
-            error = sd / np.sqrt(maps["effective_draws"].values[y, x])
+            error = sd / np.sqrt(maps["ess"].values[y, x])
             # Eight standard normals, in pairs: the largest is above 4.5 in fewer than one of ten
             # thousand cases.
             assert abs(maps[name].values[y, x] - mean) < 4.5 * error
@@ -79,7 +79,7 @@ def test_a_pixel_without_a_mode_is_searched_by_the_method_of_one_capture(
     maps = pb.fit_pixels(one, method=pb.methods.Importance(draws=1024), **ASKED)
     assert (maps["status"] == Status.GOOD).all()
     mean, sd, _ = on_a_grid(one["q"].values[0, 0], NOISE, VIEWS)[NAMES[0]]
-    error = sd / np.sqrt(float(maps["effective_draws"][0, 0]))
+    error = sd / np.sqrt(float(maps["ess"][0, 0]))
     assert abs(float(maps[NAMES[0]][0, 0]) - mean) < 4.5 * error
 
 
@@ -105,11 +105,11 @@ def test_a_second_mode_that_another_start_finds_is_not_left_out(image: xr.Datase
     positive = image.assign(q=xr.full_like(image["q"], 0.36)).isel(y=[0], x=slice(3))
     asked = ASKED | {"model": squared}
     one = pb.fit_pixels(positive, **asked)
-    assert (one["approach"] == MethodUsed.IMPORTANCE).all()
+    assert (one["method"] == MethodUsed.IMPORTANCE).all()
     maps = pb.fit_pixels(positive, method=pb.methods.CorrectedLaplace(starts=4), **asked)
     assert (maps["status"] == Status.GOOD).all()
     for x in range(3):
-        error = 0.6 / np.sqrt(float(maps["effective_draws"][0, x]))
+        error = 0.6 / np.sqrt(float(maps["ess"][0, x]))
         assert abs(float(maps["root"][0, x])) < 4.5 * error
         low, high = maps["root_quantile"][[0, -1], 0, x]
         assert float(low) < -0.5 < 0.5 < float(high)
@@ -120,7 +120,7 @@ def test_the_map_says_how_it_was_made(weighted: xr.Dataset, tmp_path: Path) -> N
     assert json.loads(weighted.attrs[PROVENANCE])["method"] == "importance"
     page = pb.report(weighted, tmp_path / "report").read_text()
     assert "importance sampling from mixtures at all modes" in page
-    assert len(APPROACHES) == len(MethodUsed)  # each has a color
+    assert len(METHODS_USED) == len(MethodUsed)  # each has a color
     assert "all by weighted draws of normal approximations" in page
 
 

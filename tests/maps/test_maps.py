@@ -196,7 +196,7 @@ def test_a_map_without_weights_is_the_laplace_fit_of_its_pixel() -> None:
     maps = mapped(image, plan).isel(y=0, x=1)
     pixel = image.isel(y=0, x=1, drop=True)
     fit = pb.fit(pixel, method=pb.methods.Laplace(draws=40_000, chains=1), seed=1, **ASKED)
-    assert maps["approach"] == MethodUsed.LAPLACE
+    assert maps["method"] == MethodUsed.LAPLACE
     assert maps["status"] == Status.GOOD
     for name in NAMES:
         draws = fit["posterior"][name].to_numpy().ravel()
@@ -238,10 +238,10 @@ def test_single_precision_finds_the_same_maps(image: xr.Dataset) -> None:
         mapped(corner, planned(corner, CorrectedLaplace(sampler=None), precision=precision))
         for precision in ("single", "double")
     )
-    assert (single["approach"] == double["approach"]).all()
-    weighted = double["approach"].isin([MethodUsed.IMPORTANCE, MethodUsed.ADAPTED])
+    assert (single["method"] == double["method"]).all()
+    weighted = double["method"].isin([MethodUsed.IMPORTANCE, MethodUsed.ADAPTED])
     assert weighted.mean() > 0.75  # the others are for the sampler, which is not asked here
-    at_once = (double["approach"] == MethodUsed.IMPORTANCE).values
+    at_once = (double["method"] == MethodUsed.IMPORTANCE).values
     assert at_once.mean() > 0.5  # adapted proposals carry errors further than the bound below
     for name in NAMES:
         sd = double[f"{name}_sd"].values
@@ -269,7 +269,7 @@ def test_a_map_says_what_it_holds_and_how_it_was_made(plan: MapPlan, maps: xr.Da
         assert maps[name].dtype == np.float32
         assert (np.diff(maps[f"{name}_quantile"].values, axis=0) >= 0.0).all()
     assert maps["status"].attrs["flag_meanings"].split()[Status.GOOD] == "good"
-    assert maps["approach"].attrs["flag_meanings"].split()[MethodUsed.NUTS] == "nuts"
+    assert maps["method"].attrs["flag_meanings"].split()[MethodUsed.NUTS] == "nuts"
     said = json.loads(maps.attrs[PROVENANCE])
     assert said["seed"] == 0
     assert CorrectedLaplace(**{**said["settings"], "sampler": Importance()}) == plan.settings

@@ -89,7 +89,7 @@ def case(request: pytest.FixtureRequest) -> tuple[str, xr.Dataset, Grid]:
 
 def test_nuts_agrees_with_the_grid_everywhere(case: tuple[str, xr.Dataset, Grid]) -> None:
     _, capture, grid = case
-    settings = pb.methods.Nuts(draws=2000, most_draws=4000, effective_draws=2000.0)
+    settings = pb.methods.Nuts(draws=2000, most_draws=4000, ess=2000.0)
     result = pb.fit(capture, scene=PLATE, links=LINKS, method=settings, seed=1)
     for name in NAMES:
         draws = result["posterior"][name].to_numpy()

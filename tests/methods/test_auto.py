@@ -39,7 +39,7 @@ class Made(AbstractMethod):
     """Independent draws of a normal posterior, with diagnostics as one likes."""
 
     draws: int = 4000
-    k_hat: float = 0.1
+    pareto_k: float = 0.1
     r_hat: float = np.nan
     problem: str = ""
     fails: str = ""
@@ -54,9 +54,9 @@ class Made(AbstractMethod):
             z,
             {},
             [self.problem] if self.problem else [],
-            k_hat=self.k_hat,
+            pareto_k=self.pareto_k,
             r_hat=self.r_hat,
-            effective_draws=float(self.draws),
+            ess=float(self.draws),
         )
 
 
@@ -141,15 +141,15 @@ def test_the_first_rung_that_is_good_enough_is_taken():
 @pytest.mark.thorough
 def test_what_a_method_says_of_its_draws_stays_with_the_result():
     said = json.loads(
-        pb.fit(capture(), model=line, links=LINKS, method=Made(k_hat=2.0)).attrs["polar_bayes"]
+        pb.fit(capture(), model=line, links=LINKS, method=Made(pareto_k=2.0)).attrs["polar_bayes"]
     )
-    assert (said["k_hat"], said["effective_draws"], said["r_hat"]) == (2.0, 4000.0, None)
+    assert (said["pareto_k"], said["ess"], said["r_hat"]) == (2.0, 4000.0, None)
 
 
 @each(
     ("rung", "why"),
     [
-        (Made(k_hat=0.9), "its Pareto k-hat is 0.90"),
+        (Made(pareto_k=0.9), "its Pareto k is 0.90"),
         (Made(r_hat=1.2), "its R-hat is 1.200"),
         (Made(problem="it broke"), "it broke"),
         (Made(fails="no peak"), "no peak"),
@@ -168,12 +168,12 @@ def test_too_few_draws_are_mended_by_more_of_the_same():
     steps = said["auto"]["steps"]
     assert [step["name"] for step in steps] == ["rung 0", "rung 0"]
     assert "Monte Carlo error" in steps[0]["why"]
-    assert steps[1]["effective_draws"] > 4 * steps[0]["effective_draws"]
+    assert steps[1]["ess"] > 4 * steps[0]["ess"]
     assert steps[1]["taken"]
 
 
 def test_where_nothing_is_good_enough_the_nearest_is_returned_and_flagged():
-    result, said = fitted(Made(draws=400, k_hat=0.9), Made(draws=60), tolerance=0.01)
+    result, said = fitted(Made(draws=400, pareto_k=0.9), Made(draws=60), tolerance=0.01)
     assert not said["auto"]["met"]
     assert said["auto"]["chosen"] == "rung 1"
     judged = pb.verdict(result)
@@ -186,12 +186,12 @@ def test_where_nothing_is_good_enough_the_nearest_is_returned_and_flagged():
 
 @pytest.mark.thorough
 def test_of_two_in_doubt_the_dearer_one_is_returned():
-    _, said = fitted(Made(k_hat=0.9), Made(k_hat=np.nan, r_hat=1.2))
+    _, said = fitted(Made(pareto_k=0.9), Made(pareto_k=np.nan, r_hat=1.2))
     assert (said["auto"]["chosen"], said["auto"]["met"]) == ("rung 1", False)
 
 
 def test_after_its_time_nothing_begins():
-    _, said = fitted(Made(k_hat=0.9), Made(), seconds=1e-9)
+    _, said = fitted(Made(pareto_k=0.9), Made(), seconds=1e-9)
     assert [step["why"] for step in said["auto"]["steps"]][1] == "the time was up"
     assert not said["auto"]["met"]
 
@@ -207,7 +207,7 @@ def test_only_the_first_is_let_off_the_time_though_it_had_no_answer():
 
 def test_what_is_stuck_is_abandoned_and_the_best_answer_so_far_is_returned():
     """Neither compilation nor compiled programs can be interrupted."""
-    rungs = (("rung 0", Made(k_hat=0.9)), ("rung 1", Stuck()), ("rung 2", Made()))
+    rungs = (("rung 0", Made(pareto_k=0.9)), ("rung 1", Stuck()), ("rung 2", Made()))
     here = problem(line)
     Given(given=rungs[:1]).run(here, KEY, no_progress)  # what judges draws is compiled
     begin = time.perf_counter()
@@ -217,7 +217,7 @@ def test_what_is_stuck_is_abandoned_and_the_best_answer_so_far_is_returned():
     assert time.perf_counter() - begin < 0.5 * Stuck.seconds
     said = found.metadata["auto"]
     assert [step["why"] for step in said["steps"]] == [
-        "its Pareto k-hat is 0.90",
+        "its Pareto k is 0.90",
         "abandoned when the time was up",
         "the time was up",
     ]
@@ -235,7 +235,7 @@ def test_the_time_is_counted_from_when_the_fit_was_asked_for(monkeypatch: pytest
 
     fitted(Made())
     monkeypatch.setattr(fitting, "make_problem", slowly)
-    _, said = fitted(Made(k_hat=0.9), Made(), seconds=0.5)
+    _, said = fitted(Made(pareto_k=0.9), Made(), seconds=0.5)
     assert [step["why"] for step in said["auto"]["steps"]][1] == "the time was up"
 
 
@@ -262,7 +262,7 @@ def test_the_time_is_kept_on_a_busy_machine():
 @pytest.mark.thorough
 def test_comparisons_are_fitted_by_what_was_taken_and_in_the_time_that_is_left():
     taken, here = Made(), problem(line)
-    auto = Given(given=(("rung 0", Made(k_hat=0.9)), ("rung 1", taken)), seconds=600.0)
+    auto = Given(given=(("rung 0", Made(pareto_k=0.9)), ("rung 1", taken)), seconds=600.0)
     found = auto.run(here, KEY, no_progress)
     assert auto.for_comparison(here, found) == (taken,)
     assert auto.deadline(here) == here.start_time + 600.0
@@ -325,7 +325,7 @@ def test_a_normal_posterior_is_met_by_the_cheapest():
 @pytest.mark.thorough
 @each("seed", range(1, 4))
 def test_of_a_funnel_no_draws_are_taken_that_are_worse_than_they_say(seed):
-    """At 0.1 sd weighted draws once were, which had lost the wide end (k-hat .5, error .12)."""
+    """At 0.1 sd weighted draws once were, which had lost the wide end (Pareto k .5, error .12)."""
     for tolerance in (0.5, 0.1):
         method = pb.methods.Auto(tolerance, 600.0)
         result = pb.fit(capture(), model=funnel, links=LINKS, method=method, seed=seed)

@@ -22,7 +22,7 @@ SMALL = {
     "point": pb.methods.Point(starts=2),
     "laplace": pb.methods.Laplace(draws=1000),
     "importance": pb.methods.Importance(),
-    "nuts": pb.methods.Nuts(effective_draws=2000.0),
+    "nuts": pb.methods.Nuts(ess=2000.0),
 }
 WITHOUT_PRIOR = {"point"}
 
@@ -73,11 +73,11 @@ def test_a_normal_posterior_is_found_by_every_rung(name):
     sd = np.sqrt(np.diagonal(covariance))
     flat = draws.reshape(2, -1)
     # Five standard errors.
-    worth = min(found.effective_draws, flat.shape[1])
+    worth = min(found.ess, flat.shape[1])
     slack = 5.0 / np.sqrt(worth)
     assert (np.abs(flat.mean(axis=1) - mean) / sd < slack).all()
     assert (np.abs(flat.std(axis=1) / sd - 1.0) < slack).all()
-    assert not found.k_hat > 0.7
+    assert not found.pareto_k > 0.7
     assert not found.r_hat > 1.01
 
 
@@ -110,7 +110,7 @@ def test_both_modes_are_weighed_alike():
     assert not found.problems
     _, draws = labeled(here, found.z)
     share = float(np.mean(draws[-1] > 0.0))  # the root is the last in the alphabet
-    assert abs(share - 0.5) < 5.0 * 0.5 / np.sqrt(min(found.effective_draws, draws[0].size))
+    assert abs(share - 0.5) < 5.0 * 0.5 / np.sqrt(min(found.ess, draws[0].size))
 
 
 @pytest.mark.thorough
@@ -134,10 +134,10 @@ def test_weighted_draws_find_what_chains_left_out():
     both = here.constrain(run(SMALL["importance"], here).z)
     key = jax.random.key(5)
     told = tail_shares(here, both, key)["tails"]
-    assert told["k_hat"] < 0.7
+    assert told["pareto_k"] < 0.7
     for below, above in told["shares"]["root"] + told["shares"]["other"]:
         # Five standard errors of 2.5%, of both methods.
-        error = np.sqrt(0.025 * 0.975 * (1.0 / told["effective_draws"] + 1.0 / 1000.0))
+        error = np.sqrt(0.025 * 0.975 * (1.0 / told["ess"] + 1.0 / 1000.0))
         assert max(abs(below - 0.025), abs(above - 0.025)) < 5.0 * error
     one = tail_shares(here, both | {"root": np.abs(both["root"])}, key)["tails"]
     ((below, above),) = one["shares"]["root"]
@@ -148,8 +148,8 @@ def test_weighted_draws_find_what_chains_left_out():
 @pytest.mark.thorough
 def test_weights_that_do_not_reach_all_of_a_posterior_are_a_problem():
     found = run(pb.methods.Importance(draws=4096, rounds=1), problem(deep_funnel))
-    assert found.k_hat > 0.7
-    assert any("Pareto k-hat" in problem for problem in found.problems)
+    assert found.pareto_k > 0.7
+    assert any("Pareto k" in problem for problem in found.problems)
 
 
 def test_further_rounds_follow_a_posterior_that_is_not_normal():
@@ -158,10 +158,10 @@ def test_further_rounds_follow_a_posterior_that_is_not_normal():
         [run(pb.methods.Importance(draws=1024, rounds=rounds), here, seed) for seed in seeds]
         for rounds in (1, 6)
     )
-    effective = [sum(each.effective_draws for each in some) for some in (once, found)]
+    effective = [sum(each.ess for each in some) for some in (once, found)]
     assert effective[1] > 2.0 * effective[0]
-    assert min(each.k_hat for each in once) > 0.7
-    assert max(each.k_hat for each in found) < 0.7
+    assert min(each.pareto_k for each in once) > 0.7
+    assert max(each.pareto_k for each in found) < 0.7
 
 
 def test_the_expected_error_is_the_one_that_is_seen():
@@ -197,7 +197,7 @@ def test_draws_that_are_no_numbers_have_an_infinite_error():
 def test_draws_are_scaled_and_settings_kept():
     assert pb.methods.Laplace(draws=500).scale_draws(2.0) == pb.methods.Laplace(draws=1000)
     chains = pb.methods.Nuts(warmup=77).scale_draws(2.0)
-    assert (chains.draws, chains.most_draws, chains.effective_draws) == (1000, 16000, 900.0)
+    assert (chains.draws, chains.most_draws, chains.ess) == (1000, 16000, 900.0)
     assert chains.warmup == 77
     assert pb.methods.Point().scale_draws(2.0) is None
 

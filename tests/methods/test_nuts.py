@@ -52,7 +52,7 @@ def test_where_draws_diverge_it_changes_nothing_either() -> None:
     with jax.enable_x64(True):
         for block in (20, 50, 100):
             settings = pb.methods.Nuts(
-                chains=2, warmup=100, draws=100, most_draws=400, effective_draws=1e6, block=block
+                chains=2, warmup=100, draws=100, most_draws=400, ess=1e6, block=block
             )
             here = target(3, 2)._replace(density=funnel, given=jnp.asarray(3.0))
             here = here._replace(potential=jax.value_and_grad(lambda z: funnel(z, 3.0)))

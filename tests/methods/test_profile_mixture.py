@@ -9,7 +9,7 @@ from polar_bayes.inference.initialization import Coordinates
 from polar_bayes.methods.profile_mixture import profile_mixture
 from polar_bayes.numerics.mixtures import draw_mixture, log_density
 from polar_bayes.numerics.optimize import Modes, NumpyPotential
-from polar_bayes.numerics.psis import effective_draws, smooth
+from polar_bayes.numerics.psis import smooth, weighted_ess
 
 DRAWS = 8192
 SHARE, NARROW, FAR, WIDE, THICK, BEND = 0.7, 0.2, -2.0, 1.0, 0.2, 0.1
@@ -43,7 +43,7 @@ def weighted(peak: Coordinates) -> tuple[np.ndarray, np.ndarray, float]:
     draws = np.asarray(draw_mixture(mixture, DRAWS, jax.random.key(0)))
     proposed = np.asarray(log_density(mixture, jnp.asarray(draws)))
     weights, _ = smooth((peak.log_density(draws) - proposed)[None])
-    return draws, weights[0], float(effective_draws(weights)[0])
+    return draws, weights[0], float(weighted_ess(weights)[0])
 
 
 def test_an_arm_gets_draws_and_its_weight() -> None:

@@ -167,7 +167,7 @@ def test_the_posterior_is_that_of_another_density_and_another_sampler() -> None:
     capture = spectral_plate(colors, error=TWIN_ERROR, seed=21, views=np.linspace(35.0, 75.0, 6))
     theirs, independent = twin_draws(capture)
     assert independent > 1000.0
-    settings = pb.methods.Nuts(draws=1000, most_draws=2000, effective_draws=1000.0)
+    settings = pb.methods.Nuts(draws=1000, most_draws=2000, ess=1000.0)
     prior = {"subsurface_fraction": dist.Beta(2.0, 2.0)}  # that of the twin
     result = fit(capture, method=settings, priors=prior, seed=4)
     assert pb.verdict(result).passed

@@ -139,7 +139,7 @@ def test_the_posterior_is_that_of_another_density_and_another_sampler() -> None:
     capture = plates([1.46, 1.5, 1.53], TWIN_ERROR, TWIN_VIEWS, seed=2)
     theirs, independent = twin_draws(capture)
     assert independent > 1000.0
-    settings = pb.methods.Nuts(draws=1000, most_draws=3000, effective_draws=1500.0)
+    settings = pb.methods.Nuts(draws=1000, most_draws=3000, ess=1500.0)
     prior = {"subsurface_fraction": dist.Beta(2.0, 2.0)}  # that of the twin
     result = fit(capture, method=settings, priors=prior)
     assert pb.verdict(result).converged

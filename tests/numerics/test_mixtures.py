@@ -13,7 +13,7 @@ from polar_bayes.numerics.mixtures import (
     log_density,
     moments,
 )
-from polar_bayes.numerics.psis import effective_draws, smooth
+from polar_bayes.numerics.psis import smooth, weighted_ess
 
 FAR, WIDTH = 2.0, 0.02
 
@@ -33,7 +33,7 @@ def test_weighted_draws_of_a_fitted_mixture_are_the_posterior() -> None:
     x, y = np.asarray(drawn).T
     weights, pareto_k = smooth((log_posterior(np.asarray(drawn)) - told)[None])
     assert pareto_k[0] < 0.7
-    worth = effective_draws(weights)[0]
+    worth = weighted_ess(weights)[0]
     assert worth >= 400.0
     # Four Monte Carlo errors each: three comparisons fail by chance twice in ten thousand.
     assert abs(weights[0] @ (x > 0.0) - 0.5) < 4.0 * 0.5 / np.sqrt(worth)

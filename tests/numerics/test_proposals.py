@@ -77,13 +77,13 @@ def test_where_a_normal_distribution_fails_the_posterior_of_a_grid_is_found() ->
     """Largest error of 4 Monte Carlo errors: 6e-5 a comparison, 1e-3 over all of them."""
     method = CorrectedLaplace(sampler=None)
     maps = mapped(WEAK, planned(WEAK, method))
-    adapted = np.argwhere((maps["approach"] == MethodUsed.ADAPTED).values)
+    adapted = np.argwhere((maps["method"] == MethodUsed.ADAPTED).values)
     assert len(adapted) >= 3
     for y, x in adapted:
         pixel = maps.isel(y=y, x=x)
         assert pixel["pareto_k"] > 0.7  # the normal approximation's own
         assert pixel["status"] == Status.GOOD
-        error = 1.0 / np.sqrt(float(pixel["effective_draws"]))
+        error = 1.0 / np.sqrt(float(pixel["ess"]))
         truth = on_a_grid(WEAK["q"].values[y, x], 0.15, WEAK["view_zenith"].values)
         for name in NAMES:
             mean, sd, _ = truth[name]

@@ -22,7 +22,7 @@ def maps(rows: int = 20, columns: int = 30, wavelengths: tuple[float, ...] = ())
         ends = np.linspace(-0.1, 0.1, 7).reshape(7, *[1] * mean.ndim)
         found[f"{name}_quantile"] = (("quantile", *axes), mean + ends)
     found["pareto_k"] = (dims, rng.uniform(0.0, 1.0, shape))
-    words = {"approach": "none laplace importance nuts", "status": "good masked too_few_views"}
+    words = {"method": "none laplace importance nuts", "status": "good masked too_few_views"}
     words["status"] += " not_converged not_trusted"
     for name, meanings in words.items():
         flags = rng.integers(0, len(meanings.split()), shape)
@@ -38,7 +38,7 @@ def test_every_parameter_has_its_mean_and_its_width(wavelengths: tuple[float, ..
     assert clipped(figure) == []
     titles = [axes.get_title("left") for axes in figure.axes if axes.get_title("left")]
     assert sum(title == "95% width" for title in titles) == 4
-    assert titles[-3:] == ["Pareto k", "approach", "status"]
+    assert titles[-3:] == ["Pareto k", "method", "status"]
     assert ("absorption a, 450 nm" in titles) == bool(wavelengths)
 
 

@@ -90,13 +90,13 @@ def odd() -> xr.DataTree:
 
 def mixed(**asked: object) -> xr.Dataset:
     """Of 200 pixels 160 are good: 100 by weights, 50 by a fitted proposal, 10 by NUTS."""
-    status, approach = np.full(200, Status.GOOD), np.full(200, MethodUsed.IMPORTANCE)
-    approach[100:150], approach[150:160] = MethodUsed.ADAPTED, MethodUsed.NUTS
-    status[160:195], approach[160:195] = Status.MASKED, MethodUsed.NONE
-    status[195:197], approach[195:197] = Status.TOO_FEW_VIEWS, MethodUsed.NONE
-    status[197:199], approach[197:199] = Status.NOT_TRUSTED, MethodUsed.LAPLACE
-    status[199], approach[199] = Status.NOT_CONVERGED, MethodUsed.NONE
-    flags = {"status": status.reshape(SHAPE), "approach": approach.reshape(SHAPE)}
+    status, method = np.full(200, Status.GOOD), np.full(200, MethodUsed.IMPORTANCE)
+    method[100:150], method[150:160] = MethodUsed.ADAPTED, MethodUsed.NUTS
+    status[160:195], method[160:195] = Status.MASKED, MethodUsed.NONE
+    status[195:197], method[195:197] = Status.TOO_FEW_VIEWS, MethodUsed.NONE
+    status[197:199], method[197:199] = Status.NOT_TRUSTED, MethodUsed.LAPLACE
+    status[199], method[199] = Status.NOT_CONVERGED, MethodUsed.NONE
+    flags = {"status": status.reshape(SHAPE), "methods": method.reshape(SHAPE)}
     return make_maps(MEANS, **flags, **asked)
 
 
