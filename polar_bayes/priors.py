@@ -3,10 +3,12 @@ r"""Default priors, their validation and description.
 NumPyro samples the log of a positive value. Where the prior density at zero is finite, that log has
 an unbounded left tail, which mixes slowly. `HalfNormal` is sampled in its normal score instead,
 
-$$ z = \Phi^{-1}\big(2 \Phi(v/\sigma) - 1\big) $$
+$$ z = \Phi^{-1}\big(2 \Phi(x/\sigma) - 1\big) $$
 
 under which the prior is standard normal. So are `Beta(1, b)` and `Beta(a, 1)`, whose log odds
-have such a tail towards the bound where their density is finite.
+have such a tail towards the bound where their density is finite. Any smooth map will do as a
+coordinate: in place of $\Phi$ stands a function of few operations (`log_odds`), so that programs
+compile in less time. Densities are those of that function, exactly.
 
 Every model reads the table `PRIORS`. A caller replaces any row with any NumPyro distribution of the
 right support: `priors={"refractive_index": dist.Normal(1.5, 0.02)}` is
@@ -26,7 +28,7 @@ from typing import NoReturn, override
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import erf, erfc, erfinv, gammaln, log_ndtr, ndtr, ndtri
+from jax.scipy.special import gammaln
 from jaxtyping import Array, ArrayLike, Float
 from numpyro import distributions as dist
 from numpyro.distributions import constraints, transforms
@@ -88,10 +90,29 @@ def _by_score(support: ByNormalScore) -> transforms.Transform:
     return support.transform
 
 
+BEND = 32.0 / math.pi
+"""Gives `log_odds` the slope at 0 that the log odds of a normal score have."""
+
+
+def log_odds(z: Float[Array, "..."]) -> Float[Array, "..."]:
+    r"""Log odds of a share by its score, $v = \frac12 z \sqrt{z^2 + 32/\pi}$.
+
+    $1/(1+e^{-v})$ is within .0006 of $\Phi(z)$, and its tails fall as those of $\Phi$ do.
+    """
+    return 0.5 * z * jnp.sqrt(z**2 + BEND)
+
+
+def score_of_log_odds(v: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The score of a share by its log odds."""
+    return 2.0 * v / jnp.sqrt(0.5 * (BEND + jnp.sqrt(BEND**2 + (4.0 * v) ** 2)))
+
+
+def log_slope(z: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Log of the derivative of `log_odds`."""
+    return jnp.log(z**2 + 0.5 * BEND) - 0.5 * jnp.log(z**2 + BEND)
+
+
 # --- Half-normal prior ----------------------------------------------------------------------------
-
-
-TWO_LOG_TWO = 2.0 * math.log(2.0)
 
 
 class HalfNormal(dist.HalfNormal):
@@ -104,7 +125,11 @@ class HalfNormal(dist.HalfNormal):
 
 
 class NormalScoreToHalfNormal(transforms.Transform):
-    """From a normal score to the half-normal value of that score."""
+    r"""From a normal score to the half-normal value of that score.
+
+    A share $2\Phi(-x)$ is beyond a value x of scale 1, and $\Phi(-z)$ beyond a score z: they are
+    equal where the log odds v are $e^{v(x)} = 1 + 2 e^{v(z)}$.
+    """
 
     domain = constraints.real
     codomain = constraints.positive
@@ -114,17 +139,21 @@ class NormalScoreToHalfNormal(transforms.Transform):
 
     def __call__(self, x: Array) -> Array:
         """The value of a score."""
-        return self.scale * half_normal_of_score(jnp.asarray(x))
+        odds = log_odds(jnp.asarray(x)) + math.log(2.0)
+        return self.scale * score_of_log_odds(jnp.logaddexp(odds, 0.0))
 
     @override
     def _inverse(self, y: Array) -> Array:
-        return score_of_half_normal(jnp.asarray(y) / self.scale)
+        odds = log_odds(jnp.asarray(y) / self.scale)
+        return score_of_log_odds(odds + jnp.log(-jnp.expm1(-odds)) - math.log(2.0))
 
     @override
     def log_abs_det_jacobian(
         self, x: Array, y: Array, intermediates: object | None = None
     ) -> Array:
-        return jnp.log(0.5 * self.scale) + 0.5 * ((y / self.scale) ** 2 - x**2)
+        odds = log_odds(jnp.asarray(x)) + math.log(2.0)
+        share = odds - jnp.logaddexp(odds, 0.0)  # log of the derivative of logaddexp
+        return jnp.log(self.scale) + share + log_slope(x) - log_slope(y / self.scale)
 
     @override
     def eq(self, other: object, static: bool = False) -> bool:
@@ -133,39 +162,6 @@ class NormalScoreToHalfNormal(transforms.Transform):
     @override
     def tree_flatten(self) -> tuple:
         return (self.scale,), (("scale",), {})
-
-
-@jax.custom_jvp
-def half_normal_of_score(z: Float[Array, "..."]) -> Float[Array, "..."]:
-    r"""The half-normal quantile of a normal score: $\Phi^{-1}((1+\Phi(z))/2)$."""
-    # Each half is computed from the tail that is small there. Beyond the smallest number of its
-    # precision the tail of the right half is that of its asymptote.
-    tail = 0.5 * ndtr(-z)
-    known = tail >= jnp.finfo(tail.dtype).tiny
-    high = jnp.where(known, -ndtri(tail), jnp.sqrt(z**2 + TWO_LOG_TWO))
-    return jnp.where(z < 0.0, 2.0**0.5 * erfinv(ndtr(z)), high)
-
-
-@half_normal_of_score.defjvp
-def _slope_of_folded(z: tuple, dz: tuple) -> tuple[Array, Array]:
-    x = half_normal_of_score(*z)
-    return x, 0.5 * jnp.exp(0.5 * (x**2 - z[0] ** 2)) * dz[0]
-
-
-@jax.custom_jvp
-def score_of_half_normal(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    r"""The normal score of a half-normal value: $\Phi^{-1}(2\Phi(x) - 1)$."""
-    half = 2.0**-0.5
-    tail = erfc(half * x)
-    known = tail >= jnp.finfo(tail.dtype).tiny
-    high = jnp.where(known, -ndtri(tail), jnp.sqrt(x**2 - TWO_LOG_TWO))
-    return jnp.where(x < 0.5, ndtri(erf(half * x)), high)
-
-
-@score_of_half_normal.defjvp
-def _slope_of_unfolded(x: tuple, dx: tuple) -> tuple[Array, Array]:
-    z = score_of_half_normal(*x)
-    return z, 2.0 * jnp.exp(0.5 * (z**2 - x[0] ** 2)) * dx[0]
 
 
 # --- Beta prior -----------------------------------------------------------------------------------
@@ -216,7 +212,7 @@ class NormalScoreToPower(transforms.Transform):
     r"""From a normal score z to the value of that score whose distribution is a power.
 
     $x = \Phi(z)^{1/p}$ under Beta(p, 1), and $x = 1 - \Phi(-z)^{1/p}$ under Beta(1, p), which
-    `falls`.
+    `falls`; $\Phi$ by its `log_odds`.
     """
 
     domain = constraints.real
@@ -227,7 +223,7 @@ class NormalScoreToPower(transforms.Transform):
 
     def __call__(self, x: Array) -> Array:
         """The value of a score, inside the numbers between 0 and 1 whose square is one."""
-        log_share = self._log_share(x)
+        log_share = -jnp.logaddexp(-self._odds(x), 0.0) / self.power
         value = -jnp.expm1(log_share) if self.falls else jnp.exp(log_share)
         number = jnp.finfo(value.dtype)
         return jnp.clip(value, 2.0 * number.tiny**0.5, 1.0 - number.eps)
@@ -235,19 +231,17 @@ class NormalScoreToPower(transforms.Transform):
     @override
     def _inverse(self, y: Array) -> Array:
         y = jnp.asarray(y)
-        log_tail = self.power * (jnp.log1p(-y) if self.falls else jnp.log(y))
-        # Each half is computed from the tail that is small there.
-        score = jnp.where(
-            log_tail < -math.log(2.0), -ndtri(jnp.exp(log_tail)), ndtri(-jnp.expm1(log_tail))
-        )
-        return score if self.falls else -score
+        log_share = self.power * (jnp.log1p(-y) if self.falls else jnp.log(y))
+        score = score_of_log_odds(log_share - jnp.log(-jnp.expm1(log_share)))
+        return -score if self.falls else score
 
     @override
     def log_abs_det_jacobian(
         self, x: Array, y: Array, intermediates: object | None = None
     ) -> Array:
-        density = math.log(self.power) + (self.power - 1.0) * self._log_share(x)
-        return -0.5 * jnp.square(x) - 0.5 * math.log(2.0 * math.pi) - density
+        odds = self._odds(x)
+        rest = jnp.logaddexp(-odds, 0.0)  # minus the log of the share, whose power is the value
+        return log_slope(x) - odds - rest * (1.0 + 1.0 / self.power) - math.log(self.power)
 
     @override
     def eq(self, other: object, static: bool = False) -> bool:
@@ -258,11 +252,9 @@ class NormalScoreToPower(transforms.Transform):
     def tree_flatten(self) -> tuple:
         return (), ((), {"power": self.power, "falls": self.falls})
 
-    def _log_share(self, x: Array) -> Array:
-        z = -jnp.asarray(x) if self.falls else jnp.asarray(x)
-        # Above zero the small tail tells how far the share is from 1.
-        above = jnp.log1p(-ndtr(-jnp.maximum(z, 0.0)))
-        return jnp.where(z > 0.0, above, log_ndtr(z)) / self.power
+    def _odds(self, x: Array) -> Array:
+        odds = log_odds(jnp.asarray(x))
+        return -odds if self.falls else odds
 
 
 # --- Priors that come from other pixels -----------------------------------------------------------

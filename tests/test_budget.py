@@ -24,14 +24,14 @@ CODE = {
     "physics": 2383,
     "reporting": 2986,
     "scenes": 1665,
-    "own files": 1490,
+    "own files": 1477,
     "models": 318,
-    "tests": 22612,
+    "tests": 22626,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 23327,
+    "code": 23314,
     "classes": 332,
     "constants": 416,
     "Any": 168,

@@ -5,16 +5,20 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
+import scipy.special
+import scipy.stats
 from cases import each
 from numpyro import distributions as dist
 from numpyro.distributions import biject_to
 
 from polar_bayes.priors import (
+    BEND,
     PRIORS,
     Beta,
     HalfNormal,
-    half_normal_of_score,
-    score_of_half_normal,
+    NormalScoreToHalfNormal,
+    log_odds,
+    score_of_log_odds,
 )
 
 SCALE = 0.01
@@ -25,32 +29,36 @@ REACH = {np.float64: 38.0, np.float32: 12.5}
 FAR = (-1e3, -60.0, -39.0, 38.0, 39.0, 60.0, 1e3)
 
 
-def value_in_digits(z: float) -> mpmath.mpf:
-    """The half-normal value x with 1 - Phi(x) = (1 - Phi(z)) / 2, to fifty digits."""
-    with mpmath.workdps(50):
-        wanted = mpmath.erfc(mpmath.mpf(z) / mpmath.sqrt(2)) / 2
-        low, high = mpmath.mpf(0), mpmath.mpf(50)
-        for _ in range(250):  # halvings, to fifty digits of 1e-19
-            middle = (low + high) / 2
-            above = mpmath.erfc(middle / mpmath.sqrt(2)) > wanted
-            low, high = (middle, high) if above else (low, middle)
-        return high
+def odds_in_digits(z: float) -> mpmath.mpf:
+    """Log odds of a score."""
+    exact = mpmath.mpf(z)
+    return exact * mpmath.sqrt(exact**2 + mpmath.mpf(BEND)) / 2
+
+
+def score_in_digits(odds: mpmath.mpf) -> mpmath.mpf:
+    bend = mpmath.mpf(BEND)
+    root = mpmath.sqrt(bend**2 + 16 * odds**2)
+    return 2 * odds / mpmath.sqrt((bend + root) / 2)
+
+
+def value_in_digits(z: mpmath.mpf) -> mpmath.mpf:
+    """The half-normal value of a score."""
+    return score_in_digits(mpmath.log1p(2 * mpmath.exp(odds_in_digits(z))))
 
 
 def in_digits(z: float) -> tuple[mpmath.mpf, mpmath.mpf]:
-    """The half-normal value of a score and its slope."""
-    if z > -9.0:
-        value = value_in_digits(z)
-    else:  # the value is its tail probability, to all digits
-        value = mpmath.sqrt(mpmath.pi / 2) * mpmath.ncdf(z)
-    return value, mpmath.exp((value**2 - mpmath.mpf(z) ** 2) / 2) / 2
+    """The half-normal value of a score and its slope, to fifty digits."""
+    with mpmath.workdps(600):  # a step of 1e-200 takes 200 of them
+        step = mpmath.mpf(10) ** -200
+        value = value_in_digits(mpmath.mpf(z))
+        return value, (value_in_digits(mpmath.mpf(z) + step) - value) / step
 
 
 @each("dtype", [np.float64, np.float32])
 def test_values_and_slopes_agree_with_fifty_digits(dtype: type) -> None:
     """The error of a score is that of its rounding, z dz relative in its value."""
     scores = np.asarray([z for z in SCORES if abs(z) < REACH[dtype]], dtype)
-    value_and_slope = jax.jit(jax.vmap(jax.value_and_grad(half_normal_of_score)))
+    value_and_slope = jax.jit(jax.vmap(jax.value_and_grad(NormalScoreToHalfNormal(1.0))))
     for z, *found in zip(map(float, scores), *value_and_slope(scores), strict=True):
         allowed = 30.0 * float(np.finfo(dtype).eps) * max(1.0, z**2)
         for ours, exact in zip(map(float, found), map(float, in_digits(z)), strict=True):
@@ -71,16 +79,29 @@ def test_what_is_far_out_is_finite_and_comes_back(dtype: type) -> None:
     scores = np.asarray([*SCORES, *FAR], dtype)
 
     def everything(z: jax.Array) -> tuple[jax.Array, ...]:
-        slope, value = jax.grad(score_density), half_normal_of_score(z)
-        return score_density(z), slope(z), jax.grad(slope)(z), value, score_of_half_normal(value)
+        slope, move = jax.grad(score_density), NormalScoreToHalfNormal(1.0)
+        return score_density(z), slope(z), jax.grad(slope)(z), move(z), move.inv(move(z))
 
     found = np.asarray(jax.jit(jax.vmap(everything))(scores))
     assert np.isfinite(found[:3]).all()
     for z, density, value, again in zip(map(float, scores), *found[[0, 3, 4]], strict=True):
         rounding = 40.0 * float(np.finfo(dtype).eps) * (1.0 + z**2)
-        assert density == pytest.approx(-0.5 * np.log(2.0 * np.pi) - 0.5 * z**2, abs=rounding), z
+        exact, slope = in_digits(z)
+        wanted = mpmath.log(2 / mpmath.pi) / 2 - exact**2 / 2 + mpmath.log(slope)
+        assert density == pytest.approx(float(wanted), abs=rounding), z
         if value > np.finfo(dtype).tiny:
             assert again == pytest.approx(z, abs=40.0 * rounding / (1.0 + abs(z))), z
+
+
+def test_log_odds_are_those_of_a_normal_score() -> None:
+    """To .0006 of a share, and to a twentieth of themselves in the tails."""
+    z = np.linspace(-10.0, 10.0, 2001)
+    odds = np.asarray(log_odds(z))
+    assert np.abs(scipy.special.expit(odds) - scipy.stats.norm.cdf(z)).max() < 6e-4
+    exact = scipy.stats.norm.logcdf(z) - scipy.stats.norm.logsf(z)
+    assert np.allclose(odds, exact, rtol=0.05, atol=1e-12)
+    far = np.asarray([-1e12, -1e5, -1e-30, 0.0, 1e-30, 1e5, 1e12])
+    assert np.allclose(score_of_log_odds(log_odds(far)), far, rtol=1e-14)
 
 
 @each("prior", [HalfNormal(SCALE), Beta(1.0, 3.0), Beta(10.0, 1.0), Beta(1.0, 1.0)])
@@ -99,11 +120,19 @@ def test_scores_of_draws_are_standard_normal(prior: dist.Distribution) -> None:
 
 def power_in_digits(z: float, prior: Beta) -> mpmath.mpf:
     """The value of a score under Beta(1, p) or Beta(p, 1), to fifty digits."""
-    with mpmath.workdps(50):
-        first, second = prior.concentration1, prior.concentration0
-        if first == 1.0:
-            return -mpmath.expm1(mpmath.log1p(-mpmath.ncdf(mpmath.mpf(z))) / second)
-        return mpmath.ncdf(mpmath.mpf(z)) ** (1 / mpmath.mpf(first))
+    first, second = prior.concentration1, prior.concentration0
+    below = -mpmath.log1p(mpmath.exp(-odds_in_digits(z)))  # logs of the shares below and above
+    above = -mpmath.log1p(mpmath.exp(odds_in_digits(z)))
+    return -mpmath.expm1(above / second) if first == 1.0 else mpmath.exp(below / first)
+
+
+def normal_in_digits(z: float) -> float:
+    """Log density of a score: that of the share, uniform, by the score."""
+    with mpmath.workdps(600):
+        step, odds = mpmath.mpf(10) ** -200, odds_in_digits(z)
+        slope = (odds_in_digits(mpmath.mpf(z) + step) - odds) / step
+        share = -mpmath.log1p(mpmath.exp(-odds)) - mpmath.log1p(mpmath.exp(odds))
+        return float(share + mpmath.log(slope))
 
 
 @each("dtype", [np.float64, np.float32])
@@ -124,16 +153,16 @@ def test_a_beta_with_a_shape_of_one(prior: Beta, dtype: type) -> None:
     values, back, *found = map(np.asarray, jax.jit(jax.vmap(everything))(scores))
     assert np.isfinite(found).all()
     for z, value, again, density in zip(map(float, scores), values, back, found[0], strict=True):
-        exact = power_in_digits(z, prior)
+        with mpmath.workdps(50):
+            exact = power_in_digits(z, prior)
         clipped = min(max(exact, 2.0 * float(number.tiny) ** 0.5), 1.0 - float(number.eps))
         # A rounded score moves the log of its tail by z dz, and an inverse cannot undo a clip.
         allowed = 30.0 * float(number.eps) * max(1.0, z**2)
         assert value == pytest.approx(float(clipped), rel=allowed), z
         left = min(exact, 1 - exact)
         if clipped == exact and left > 1e3 * float(number.eps):
-            normal = -0.5 * np.log(2.0 * np.pi) - 0.5 * z**2
             rounding = 300.0 * float(number.eps) * (1.0 + z**2) / float(left)
-            assert density == pytest.approx(normal, abs=rounding), z
+            assert density == pytest.approx(normal_in_digits(z), abs=rounding), z
             assert again == pytest.approx(z, abs=rounding), z
 
 

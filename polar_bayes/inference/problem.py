@@ -9,7 +9,6 @@ import time
 from collections.abc import Mapping
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from jaxtyping import Array, ArrayLike, Float
@@ -173,7 +172,7 @@ class Problem:
                 raise FitError(f"its shape is {given.shape}", where=where, hint=hint)
             if self.program.events[name] and len(set(np.isnan(given).flat)) > 1:
                 raise FitError("its entries have one density", where=where, hint="hold all or none")
-            held[name] = jnp.broadcast_to(jnp.asarray(given), shape)
+            held[name] = jax.device_put(np.broadcast_to(given, shape))
         return dataclasses.replace(self, data=dataclasses.replace(self.data, held=held))
 
     def prepare_search(self) -> None:

@@ -107,12 +107,6 @@ class Program:
     def _constrain(self, sites: dict[str, Array]) -> dict[str, Array]:
         return {name: dist.biject_to(self.supports[name])(x) for name, x in sites.items()}
 
-    def _values(self, sites: dict[str, Array], data: Observations) -> dict[str, Array]:
-        """The latent sites in their supports, those that are held at their values."""
-        values = self._constrain(sites)
-        held = {n: jnp.where(jnp.isnan(x), values[n], x) for n, x in data.held.items()}
-        return values | held
-
     def log_terms(
         self, z: Float[Array, " size"], data: Observations
     ) -> tuple[dict[str, Array], Sites]:
@@ -125,13 +119,13 @@ class Program:
     def _log_terms(
         self, model: Model, sites: dict[str, Array], data: Observations
     ) -> tuple[dict[str, Array], Sites]:
-        log_probs, trace = compute_log_probs(
-            model, (data,), {}, self._values(sites, data), sum_log_prob=False
-        )
+        free_values = self._constrain(sites)
+        values = _with_held(free_values, data)
+        log_probs, trace = compute_log_probs(model, (data,), {}, values, sum_log_prob=False)
         terms = {name: jnp.sum(own) for name, own in log_probs.items() if name not in sites}
         for name, x in sites.items():
             bijection = dist.biject_to(self.supports[name])
-            own = [log_probs[name], bijection.log_abs_det_jacobian(x, bijection(x))]
+            own = [log_probs[name], bijection.log_abs_det_jacobian(x, free_values[name])]
             if name in data.held:
                 free = jnp.isnan(data.held[name])
                 own = [jnp.where(_all_of(free, term), term, 0.0) for term in own]
@@ -156,7 +150,8 @@ class Program:
 
     def trace_at(self, sites: dict[str, Array], data: Observations) -> dict[str, dict]:
         """The same of the unconstrained latent sites by name."""
-        fixed = handlers.substitute(self.model, data=self._values(sites, data))
+        values = _with_held(self._constrain(sites), data)
+        fixed = handlers.substitute(self.model, data=values)
         return _trace(fixed, jax.random.key(0), data)
 
     def parameters(self, z: Float[Array, " size"], data: Observations) -> dict[str, Array]:
@@ -298,6 +293,12 @@ class Program:
 
 def _total(terms: Mapping[str, Array], data: Observations) -> Array:
     return sum(terms.values(), jnp.zeros((), data.brightness.dtype))
+
+
+def _with_held(values: dict[str, Array], data: Observations) -> dict[str, Array]:
+    """Latent sites in their supports, those that are held at their values."""
+    held = {n: jnp.where(jnp.isnan(x), values[n], x) for n, x in data.held.items()}
+    return values | held
 
 
 def _all_of(mask: Array, like: Array) -> Array:
