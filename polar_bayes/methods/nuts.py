@@ -3,7 +3,8 @@
 NumPyro's kernel advances a chain by a block of draws at a time. One compiled block serves every
 chain; chains run on threads, which need not wait for each other within a block. After each round of
 blocks R-hat and effective sample sizes are computed: sampling continues until every coordinate has
-reached the goals, within the limits of the settings. The draws do not depend on the threads.
+reached the goals, within the limits of the settings. The draws do not depend on the threads. After
+the warm-up all chains go on with one step size and metric, pooled over them.
 
 Where a draw diverged, the steps were too long for a part of the posterior, which the chains may
 have left out: they are sampled again with half the step size, which is what a higher target
@@ -16,6 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, Self, override
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpyro import infer
@@ -117,7 +119,8 @@ class Nuts(AbstractMethod):
         target = target._replace(starts=np.repeat(target.starts, self.chains, axis=0))
         sampler = self._sampler(target, problem)
         if not sampler.advance.is_begun:
-            sampler.advance.begin(sampler.init(target, first_key(), 0), target.given)
+            state = sampler.init(target, first_key(), 0)
+            sampler.advance.begin(state, target.given, np.int32(0))
 
     @override
     def for_comparison(self, problem: Problem, draws: PosteriorDraws) -> tuple[AbstractMethod, ...]:
@@ -190,32 +193,29 @@ def sample(
     warmup = sampler.static.warmup
     states = [sampler.init(target, key, chain) for chain in range(settings.chains)]
     # Compiled before the threads start: all then share one executable.
-    advance = sampler.advance.program(states[0], target.given)
+    advance = sampler.advance.program(states[0], target.given, np.int32(0))
 
     rounds: list[Step] = []
     warmup_steps = np.zeros(settings.chains, int)
-    warmup_blocks = -(-warmup // settings.block)
-    blocks = warmup_blocks - (-settings.draws // settings.block)
+    wanted, done = warmup + settings.draws, 0
 
-    done = 0
-
-    def advance_all(states: list[infer.hmc.HMCState]) -> tuple[list[infer.hmc.HMCState], Step]:
+    def advance_all(
+        states: list[infer.hmc.HMCState], draws: int = settings.block
+    ) -> tuple[list[infer.hmc.HMCState], Step]:
         nonlocal done
-        advanced = list(pool.map(lambda state: advance(state, target.given), states))
-        joined = jax.tree.map(lambda *x: np.stack(x), *(steps for _, steps in advanced))
-        done += 1
-        progress(min(done / blocks, 1.0))
+        count = np.int32(draws)
+        advanced = list(pool.map(lambda state: advance(state, target.given, count), states))
+        joined = jax.tree.map(lambda *x: np.stack(x)[:, :draws], *(steps for _, steps in advanced))
+        done += draws
+        progress(min(done / wanted, 1.0))
         return [state for state, _ in advanced], joined._replace(z=target.transform(joined.z))
 
     progress(0.0)
     with ThreadPoolExecutor(settings.threads) as pool:
-        for block in range(warmup_blocks):
-            states, steps = advance_all(states)
-            # The last block may hold the end of the warm-up and the first draws.
-            before = min(warmup - block * settings.block, settings.block)
-            warmup_steps += steps.n_steps[:, :before].sum(axis=1)
-        if before < settings.block:
-            rounds.append(jax.tree.map(lambda x: x[:, before:], steps))
+        for begun in range(0, warmup, settings.block):
+            states, steps = advance_all(states, min(warmup - begun, settings.block))
+            warmup_steps += steps.n_steps.sum(axis=1)
+        states = _pooled(states)
         for halvings in range(MOST_HALVINGS + 1):
             if halvings:
                 warmup_steps += _stacked(rounds).n_steps.sum(axis=1)  # they are paid for, too
@@ -258,6 +258,28 @@ def _stacked(rounds: list[Step]) -> Step:
     return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1), *rounds)
 
 
+def _pooled(states: list[infer.hmc.HMCState]) -> list[infer.hmc.HMCState]:
+    """The states with the mean of their metrics and the geometric mean of their step sizes.
+
+    All draws of the warm-up tell both better than a quarter of them, and no thread waits for the
+    chain with the shortest steps.
+    """
+    own = [state.adapt_state for state in states]
+    logs = [np.log(each.step_size) for each in own]
+    pooled = {"step_size": np.exp(np.mean(logs)).astype(logs[0].dtype)}
+    metric = np.mean([each.inverse_mass_matrix for each in own], axis=0)
+    if metric.ndim == 2:
+        # NumPyro's root, lower triangular: the metric is its transpose times itself.
+        root = np.linalg.cholesky(metric[::-1, ::-1])[::-1, ::-1].T
+        pooled["inverse_mass_matrix"], pooled["mass_matrix_sqrt_inv"] = metric, root
+        pooled["mass_matrix_sqrt"] = np.linalg.inv(root)
+    shared = jax.device_put(pooled)
+    return [
+        state._replace(adapt_state=each._replace(**shared))
+        for state, each in zip(states, own, strict=True)
+    ]
+
+
 def _with_half_the_step(state: infer.hmc.HMCState) -> infer.hmc.HMCState:
     adapted = state.adapt_state
     return state._replace(adapt_state=adapted._replace(step_size=0.5 * adapted.step_size))
@@ -286,7 +308,7 @@ class Sampler:
 
     def __init__(self, density: Density, static: Static) -> None:
         self.static = static
-        # From a state and the data to the state after a block and its steps.
+        # From a state, the data and a number of draws to the state after them, and these.
         self.advance = JitOnce(self._advance)
         self._init, self._next = infer.hmc.hmc(
             potential_fn_gen=lambda given: lambda z: density(z, given), algo="NUTS"
@@ -323,8 +345,12 @@ class Sampler:
             rng_key=jax.random.split(key, len(starts))[chain],
         )
 
-    def _advance(self, state: infer.hmc.HMCState, given: object) -> tuple[infer.hmc.HMCState, Step]:
-        def step(state: infer.hmc.HMCState, _: None) -> tuple[infer.hmc.HMCState, Step]:
+    def _advance(
+        self, state: infer.hmc.HMCState, given: object, draws: Array
+    ) -> tuple[infer.hmc.HMCState, Step]:
+        """The state after some draws, and these; the rest of a block is zero."""
+
+        def step(state: infer.hmc.HMCState) -> tuple[infer.hmc.HMCState, Step]:
             state = self._next(state, model_args=(given,))
             return state, Step(
                 z=state.z,
@@ -335,4 +361,12 @@ class Sampler:
                 lp=-state.potential_energy,
             )
 
-        return jax.lax.scan(step, state, None, length=self.static.block)
+        def add(
+            index: Array, made: tuple[infer.hmc.HMCState, Step]
+        ) -> tuple[infer.hmc.HMCState, Step]:
+            state, new = step(made[0])
+            return state, jax.tree.map(lambda x, value: x.at[index].set(value), made[1], new)
+
+        like = jax.eval_shape(step, state)[1]
+        block = jax.tree.map(lambda x: jnp.zeros((self.static.block, *x.shape), x.dtype), like)
+        return jax.lax.fori_loop(0, draws, add, (state, block))

@@ -41,6 +41,30 @@ def test_how_draws_are_cut_into_blocks_changes_nothing() -> None:
     assert np.all(stats["warmup_steps"] >= 60)  # a draw takes one step at least
 
 
+def test_chains_share_what_they_adapted() -> None:
+    """Step size and metric: a density ten times as wide in one coordinate takes no more steps."""
+    settings = pb.methods.Nuts(chains=3, warmup=200, draws=400, most_draws=400)
+    with jax.enable_x64(True):
+        taken = []
+        for width in (1.0, 10.0):
+            widths = jnp.asarray([1.0, 1.0, width])
+            here = target(3, 3)._replace(
+                density=lambda z, widths: 0.5 * jnp.sum((z / widths) ** 2),
+                given=widths,
+                potential=lambda z, widths=widths: (
+                    0.5 * float(np.sum((z / widths) ** 2)),
+                    np.asarray(z / widths**2),
+                ),
+            )
+            sampler = nuts.Sampler(here.density, settings.static(here))
+            z, stats, *_ = nuts.sample(sampler, here, jax.random.key(2), settings)
+            assert len(np.unique(stats["step_size"])) == 1
+            taken.append(stats["n_steps"].mean())
+            # Four standard errors of a variance from 300 effective draws at least.
+            np.testing.assert_allclose(z.var(axis=(0, 1)), widths**2, rtol=4.0 * (2 / 300) ** 0.5)
+    assert taken[1] < 1.5 * taken[0]
+
+
 def funnel(z: jax.Array, scale: jax.Array) -> jax.Array:
     """Neal (2003), Ann. Statist. 31, 705: at its neck every step is too long."""
     return 0.5 * (z[0] / scale) ** 2 + 0.5 * jnp.sum(z[1:] ** 2) * jnp.exp(-z[0]) + z[0]
