@@ -15,6 +15,7 @@ from numpyro.distributions.transforms import Transform
 
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink, noise_parameters
+from polar_bayes.physics.part import UNPOLARIZED
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 
 Priors = Mapping[str, dist.Distribution]
@@ -47,7 +48,11 @@ def draw_independent(name: str, data: Observations, priors: Priors) -> Float[Arr
 
 def draw(name: str, prior: dist.Distribution, data: Observations) -> Float[Array, "..."]:
     """Sample a parameter inside `over_axes(data, without=("view", ...))`; drops the view axis."""
-    return drop_view(numpyro.sample(name, prior), data)
+    return drop_view(_sample(name, prior), data)
+
+
+def _sample(name: str, prior: dist.Distribution) -> Array:
+    return numpyro.sample(name, prior, infer={"summed": name in UNPOLARIZED})
 
 
 def drop_view(value: Float[Array, "..."], data: Observations) -> Float[Array, "..."]:
@@ -145,7 +150,7 @@ def declare_readings(
     """Declare instrument, noise, and the likelihood of the readings around eq. 1."""
     # The instrument and the noise: one value for the whole capture, shared by all its patches.
     rest = [name for name in scene.parameters if name not in parameters]
-    instrument = {name: numpyro.sample(name, priors[name]) for name in rest}
+    instrument = {name: _sample(name, priors[name]) for name in rest}
     noise = {name: numpyro.sample(name, priors[name]) for name in noise_parameters(links)}
 
     parameters = {**parameters, **instrument}

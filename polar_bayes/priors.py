@@ -41,7 +41,11 @@ from polar_bayes.repr_html import DisplaySummary, Row, Table
 
 def support_bounds(prior: dist.Distribution) -> tuple[float, float]:
     """Smallest and largest value that a prior allows, infinite where it has no bound."""
-    support = prior.support
+    return constraint_bounds(prior.support)
+
+
+def constraint_bounds(support: constraints.Constraint) -> tuple[float, float]:
+    """Smallest and largest value that satisfies a constraint, infinite where it has no bound."""
     while isinstance(support, constraints.independent):
         support = support.base_constraint
     low = getattr(support, "lower_bound", -math.inf)

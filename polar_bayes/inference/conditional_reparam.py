@@ -32,13 +32,17 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
-from polar_bayes.inference.program import Program
+from polar_bayes.inference.program import Program, in_blocks
+from polar_bayes.inference.sum_reparam import SumReparam, find_sum
 from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.observation.data import Observations
 
 MOST_COEFFICIENTS = 16
 """More than so many are left as they are: their precision is factored for every gradient."""
 
+
+STEP = 0.01
+"""Of differences, in coordinates that are about standard normal."""
 
 SIDE_BY_SIDE = 50
 """Vectors that are vectorized over."""
@@ -63,17 +67,22 @@ class ConditionalInputs(eqx.Module):
 class ConditionalReparam:
     """The map between coordinates x, in which the coefficients are standardized, and a program's.
 
-    Other coordinates are the same in both, and every coordinate keeps its position.
+    Other coordinates are the same in both, but for two along a sum, where there are such; every
+    coordinate keeps its position.
     """
 
     program: Program
     names: tuple[str, ...]
     coefficients: np.ndarray
     others: np.ndarray
+    sums: SumReparam | None
 
     def potential(self, x: Float[Array, " size"], given: ConditionalInputs) -> Float[Array, ""]:
         """Minus the log density of x, up to a constant."""
-        w, log_volume = self._coefficients(x, given)
+        start = self._start(x, given.point)
+        x, log_volume = self._summands(x, given)
+        w, of_coefficients = self._coefficients(x, start, given)
+        log_volume = log_volume + of_coefficients
         # Not of one flat vector: the optics, which depend on other sites only, are then found to be
         # the same as in the Gauss-Newton step, and computed once.
         sites = self.program.unravel(x) | self._by_name(w)
@@ -83,8 +92,25 @@ class ConditionalReparam:
         self, x: Float[Array, " size"], given: ConditionalInputs
     ) -> tuple[Float[Array, " size"], Float[Array, ""]]:
         """Coordinates of the program, and the log volume of the map."""
-        w, log_volume = self._coefficients(x, given)
-        return x.at[self.coefficients].set(w), log_volume
+        start = self._start(x, given.point)
+        x, log_volume = self._summands(x, given)
+        w, of_coefficients = self._coefficients(x, start, given)
+        return x.at[self.coefficients].set(w), log_volume + of_coefficients
+
+    def backward(self, z: np.ndarray, data: Observations) -> np.ndarray:
+        """Coordinates x of vectors of the program, (row, size), their coefficients standard 0."""
+        if self.sums is not None:
+            z = in_blocks(self.sums.backward_of_block, (z,), data)
+        x = np.array(z)
+        x[:, self.coefficients] = 0.0
+        return x
+
+    def _summands(
+        self, x: Float[Array, " size"], given: ConditionalInputs
+    ) -> tuple[Float[Array, " size"], Float[Array, ""]]:
+        if self.sums is None:
+            return x, jnp.zeros((), x.dtype)
+        return self.sums.forward(x, given.data)
 
     @functools.cached_property
     def potential_jit(self) -> Callable[[Array, ConditionalInputs], Array]:
@@ -111,27 +137,53 @@ class ConditionalReparam:
         """The map around a mode of the program, with the posterior covariance there."""
         among = covariance[np.ix_(self.others, self.others)]
         across = covariance[np.ix_(self.coefficients, self.others)]
-        parts = mode[self.others], mode[self.coefficients], np.linalg.solve(among, across.T).T
+        slope = np.linalg.solve(among, across.T).T
+        others = mode[self.others]
+        if self.sums is not None:
+            # By central differences: the regression decides only how efficient sampling is.
+            steps = np.vstack([0.0 * mode, STEP * np.eye(len(mode)), -STEP * np.eye(len(mode))])
+            at, *moved = self.backward((mode + steps).astype(mode.dtype), data)[:, self.others]
+            ahead, behind = np.split(np.stack(moved), 2)
+            moves = (ahead - behind)[self.others].T / (2.0 * STEP)
+            others, slope = at, np.linalg.solve(moves.T, slope.T).T
         dtype = data.brightness.dtype
+        parts = others, mode[self.coefficients], slope
         return ConditionalInputs(
             ModeRegression(*(jnp.asarray(part, dtype) for part in parts)), data
         )
 
+    def inputs_like(self, data: Observations) -> ConditionalInputs:
+        """Inputs of the shapes that `inputs` gives, for programs to be compiled."""
+        dtype, count = data.brightness.dtype, len(self.coefficients)
+        others = jnp.zeros(len(self.others), dtype)
+        slope = jnp.zeros((count, len(self.others)), dtype)
+        return ConditionalInputs(ModeRegression(others, jnp.zeros(count, dtype), slope), data)
+
+    def _start(
+        self, x: Float[Array, " size"], point: ModeRegression
+    ) -> Float[Array, " coefficient"]:
+        return point.coefficients + point.slope @ (x[self.others] - point.others)
+
     def _coefficients(
-        self, x: Float[Array, " size"], given: ConditionalInputs
+        self,
+        x: Float[Array, " size"],
+        start: Float[Array, " coefficient"],
+        given: ConditionalInputs,
     ) -> tuple[Float[Array, " coefficient"], Float[Array, ""]]:
         """The coefficients, and the log volume of the map."""
-        mean, lower = self._conditional(x, given)
+        mean, lower = self._conditional(x, start, given)
         noise = solve_triangular(lower, x[self.coefficients], trans=1, lower=True)
         return mean + noise, -jnp.sum(jnp.log(jnp.diagonal(lower)))
 
     def _conditional(
-        self, x: Float[Array, " size"], given: ConditionalInputs
+        self,
+        x: Float[Array, " size"],
+        start: Float[Array, " coefficient"],
+        given: ConditionalInputs,
     ) -> tuple[Float[Array, " coefficient"], Float[Array, "coefficient coefficient"]]:
         """Mean of the coefficients given the others, and Cholesky factor of their precision."""
-        point, program = given.point, self.program
+        program = self.program
         sites = program.unravel(x)
-        start = point.coefficients + point.slope @ (x[self.others] - point.others)
 
         def predict(w: Array) -> tuple[list[Array], Any]:
             """Means of all readings; and these with variances, readings and the priors of w."""
@@ -190,11 +242,10 @@ def find_coefficients(program: Program, data: Observations) -> ConditionalRepara
         return None
     coefficients = np.concatenate(found)
     others = np.setdiff1d(np.arange(program.size), coefficients)
-    reparam = ConditionalReparam(program, names, coefficients, others)
-    size = program.size
+    reparam = ConditionalReparam(program, names, coefficients, others, find_sum(program))
     try:
-        given = reparam.inputs(np.zeros(size), np.eye(size), data)
-        jax.eval_shape(reparam.potential, jnp.zeros(size), given)
+        given = reparam.inputs_like(data)
+        jax.eval_shape(reparam.potential, jnp.zeros(program.size), given)
     except NotImplementedError:  # a link's distribution without mean or variance
         return None
     return reparam

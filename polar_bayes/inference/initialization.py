@@ -192,6 +192,7 @@ class JointInit(AbstractInit):
     @functools.cached_property
     def _coordinates(self) -> Coordinates:
         reparam, program = self.initializer.reparam, self.initializer.program
+        prior = from_prior(program, first_key(), BLOCK, self.data)
         own = Coordinates(
             program.potential_jit,
             self.data,
@@ -199,20 +200,19 @@ class JointInit(AbstractInit):
             lambda z: program.log_density(z, self.data),
             self.modes,
             np.arange(program.size),
-            finite_sd(from_prior(program, first_key(), BLOCK, self.data)),
+            finite_sd(prior),
         )
         if reparam is None:
             return own
         dtype = self.data.brightness.dtype
         given = reparam.inputs(self.modes.z[0], self.modes.covariance[0], self.data)
         potential = NumpyPotential(reparam.value_and_gradient, given, dtype)
-        starts = self.modes.z.copy()
-        starts[:, reparam.coefficients] = 0.0  # given the others, their mean
+        starts = reparam.backward(self.modes.z, self.data)
         with ignore_line_search_warnings():
             modes = distinct_modes([find_mode(potential, start) for start in starts])
         if modes is None:
             return own
-        prior_sd = own.prior_sd.copy()
+        prior_sd = finite_sd(reparam.backward(prior, self.data))
         prior_sd[reparam.coefficients] = 1.0
         return Coordinates(
             reparam.potential_jit,
@@ -394,7 +394,7 @@ class JointInitializer(AbstractInitializer):
 
         if reparam is None:
             return target(self.program.potential_jit, data)
-        given = reparam.inputs(starts[0], metric, data)
+        given = reparam.inputs_like(data)
         reparam.value_and_gradient.begin(starts[0], given)
         return target(reparam.potential_jit, given)
 

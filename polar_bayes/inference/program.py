@@ -67,6 +67,7 @@ class Program:
     supports: Mapping[str, dist.constraints.Constraint]
     families: Mapping[str, str]
     auxiliary: tuple[str, ...]
+    summed: tuple[str, ...]
     derived: tuple[str, ...]
     observed: tuple[str, ...]
     size: int
@@ -365,6 +366,7 @@ def compile_program(model: Model, data: Observations) -> Program:
         supports=supports,
         families={name: family_of(site["fn"]) for name, site in latent.items()},
         auxiliary=tuple(name for name, site in latent.items() if is_auxiliary(site)),
+        summed=tuple(name for name, site in latent.items() if _is_summed(site)),
         derived=tuple(derived),
         observed=observed,
         size=flat.size,
@@ -384,6 +386,11 @@ def places(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
 def is_auxiliary(site: Site) -> bool:
     """True for a latent site with `infer={"auxiliary": True}`: a coordinate, not a parameter."""
     return bool(site["infer"].get("auxiliary", False))
+
+
+def _is_summed(site: Site) -> bool:
+    """True for one number with `infer={"summed": True}`: readings determine the sum of such."""
+    return bool(site["infer"].get("summed", False)) and not np.shape(site["value"])
 
 
 def noise_free(trace: dict, name: str) -> Array:

@@ -237,6 +237,10 @@ ABSENT: dict[str, Absence] = {
 """The simplest world: a bare and smooth surface, and an instrument without faults."""
 
 
+UNPOLARIZED = ("leakage", "subsurface_fraction")
+"""Shares of the light that lose their polarization: readings determine their sum first."""
+
+
 def notation(name: str) -> Quantity:
     """The row of a parameter, or of its population, or one made of its name."""
     population = {"_location": "population median of", "_spread": "population spread of"}
