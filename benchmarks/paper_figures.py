@@ -35,7 +35,6 @@ from polar_bayes.reporting.style import (
     VERMILLION,
     grid,
     lighten,
-    set_tick_style,
     styled,
 )
 
@@ -77,7 +76,6 @@ def dop(study: Study) -> Picture:
             )
         axes.axvline(GRAZING, color=GRAY, lw=0.8, ls="--")
         axes.set(title=name, ylim=(0, 1), xlim=(0, 90), xticks=[0, 30, 60, 90])
-        set_tick_style(axes)
     picture.supxlabel("view zenith [degree]", fontsize=9)
     picture.supylabel("degree of polarization", fontsize=9)
     handles, labels = panels[0].get_legend_handles_labels()
@@ -112,7 +110,6 @@ def grazing(study: Study) -> Picture:
             title="refractive index n",
             xticks=[45, 55, 65, 75, 85],
         )
-        set_tick_style(axes)
     return picture
 
 
@@ -140,7 +137,6 @@ def calibration(study: Study) -> Picture:
         for method, own in ranks.items():
             _ecdf(axes, own[name][np.isfinite(own[name])], method)
         axes.set(title=f"{name.replace('_', ' ')} {LABELS[name]}", xlim=(0, 1), xticks=[0, 0.5, 1])
-        set_tick_style(axes)
     picture.supxlabel("rank of the truth in the posterior", fontsize=9)
     picture.supylabel("share of ranks below, minus that of uniform ranks", fontsize=9)
     handles, labels = panels[0].get_legend_handles_labels()

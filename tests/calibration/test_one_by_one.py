@@ -18,6 +18,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference import hierarchical_reparam, problem
 from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.inference.problem import Problem, compile_model
+from polar_bayes.inference.program import BLOCK
 from polar_bayes.inference.request import resolve
 from polar_bayes.methods.method import AbstractMethod, PosteriorDraws, thin_draws
 from polar_bayes.observation.data import observe
@@ -183,7 +184,7 @@ def test_chains_of_any_length_have_their_parameters(capture: xr.Dataset) -> None
     data = observe(request.capture)
     here = problem.Problem(compile_model(request, data), data, jax.random.key(1))
     program = here.program
-    z = np.random.default_rng(1).normal(size=(2, problem.BLOCK + 3, program.size))
+    z = np.random.default_rng(1).normal(size=(2, BLOCK + 3, program.size))
     found = here.constrain(z)
     assert found["level"].shape[:2] == z.shape[:2]
     last = program.parameters(z[1, -1], data)["level"]
