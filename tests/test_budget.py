@@ -23,15 +23,15 @@ CODE = {
     "observation": 474,
     "physics": 2384,
     "reporting": 2986,
-    "scenes": 1665,
+    "scenes": 1666,
     "own files": 1478,
     "models": 320,
-    "tests": 22739,
+    "tests": 22740,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 23442,
+    "code": 23443,
     "classes": 333,
     "constants": 418,
     "Any": 168,

@@ -125,7 +125,9 @@ def _without(
     """The problem without terms of the instrument, and the parameters that it does not have."""
     gone = {name for term in terms for name in term.parameters}
     neutral = {name: value for term in terms for name, value in term.neutral.items()}
-    if all(term.neutral or not term.parameters for term in terms) and problem.data.held:
+    is_neutral = all(term.neutral or not term.parameters for term in terms)
+    # A model of the user's own may know some of them, or sample none.
+    if is_neutral and problem.data.held and neutral.keys() <= problem.data.held.keys():
         return problem.hold(neutral), gone
     scene = request.scene
     for term in terms:

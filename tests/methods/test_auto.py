@@ -268,7 +268,6 @@ def test_comparisons_are_fitted_by_what_was_taken_and_in_the_time_that_is_left()
     assert auto.deadline(here) == here.start_time + 600.0
 
 
-@pytest.mark.thorough
 def test_the_fit_beside_is_made_by_the_method_of_the_answer():
     """The instrument is told apart by comparing: never by choosing a method once more."""
     scene = pb.Scene(
