@@ -49,7 +49,9 @@ def test_by_an_edited_file(capture: xr.Dataset, tmp_path: Path) -> None:
         "draw_independent(name, data, priors)",
         "draw_independent(name, data, OWN if name in OWN else priors)",
     ).replace(
-        "def per_material(", 'OWN = {"subsurface_fraction": dist.Beta(1.0, 30.0)}\n\n\ndef mine('
+        "def per_material(",
+        "from numpyro import distributions as dist\n\n"
+        'OWN = {"subsurface_fraction": dist.Beta(1.0, 30.0)}\n\n\ndef mine(',
     )
     assert edited != text
     (tmp_path / "mine.py").write_text(edited)
