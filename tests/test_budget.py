@@ -26,7 +26,7 @@ CODE = {
     "scenes": 1666,
     "own files": 1478,
     "models": 320,
-    "tests": 22740,
+    "tests": 22742,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
