@@ -22,7 +22,7 @@ CODE = {
     "numerics": 882,
     "observation": 474,
     "physics": 2384,
-    "reporting": 2986,
+    "reporting": 2987,
     "scenes": 1666,
     "own files": 1478,
     "models": 320,
@@ -31,7 +31,7 @@ CODE = {
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 23443,
+    "code": 23444,
     "classes": 333,
     "constants": 418,
     "Any": 168,

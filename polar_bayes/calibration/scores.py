@@ -108,7 +108,7 @@ def uniformity(sample: Float[np.ndarray, " size"]) -> Uniformity:
 def _smallest_p_value(samples: Float[np.ndarray, "sample size"]) -> Float[np.ndarray, " sample"]:
     count = samples.shape[-1]
     points = min(count, MAX_POINTS)
-    cell = np.minimum((samples * points).astype(int), points - 1)
+    cell = np.clip(samples * points, 0, points - 1).astype(int)  # an edited file may hold others
     histogram = np.zeros((len(samples), points), int)
     np.add.at(histogram, (np.arange(len(samples))[:, None], cell), 1)
     below = np.cumsum(histogram, axis=-1)[:, :-1]

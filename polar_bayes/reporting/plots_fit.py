@@ -264,8 +264,9 @@ def _scaled_histogram(
     """A histogram over its own range, scaled to height 1."""
     inside = values[(values >= limits[0]) & (values <= limits[1])]
     counts, edges = np.histogram(inside, 16 if inside.size < 1000 else 30)
-    axes.stairs(counts / counts.max(), edges, fill=True, color=lighten(color, share))
-    axes.stairs(counts / counts.max(), edges, color=color, lw=0.8)
+    heights = counts / max(counts.max(), 1)  # nothing may be inside
+    axes.stairs(heights, edges, fill=True, color=lighten(color, share))
+    axes.stairs(heights, edges, color=color, lw=0.8)
 
 
 def _draw_truth(axes: Axes, x: float, y: float) -> None:
