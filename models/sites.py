@@ -52,6 +52,7 @@ def draw(name: str, prior: dist.Distribution, data: Observations) -> Float[Array
 
 
 def _sample(name: str, prior: dist.Distribution) -> Array:
+    """Sample a parameter of a scene, and say whether readings know it by a sum only."""
     return numpyro.sample(name, prior, infer={"summed": name in UNPOLARIZED})
 
 

@@ -378,7 +378,7 @@ def _recorder(
 ) -> Callable[..., dict[str, Array]]:
     """`_record` of a scene and its links, compiled; another one where their code has changed."""
     scene = dataclasses.replace(scene)  # without its ledger
-    key = fingerprint(scene, links, tuple(links), image, code=(scene, links))
+    key = fingerprint(scene, links, image, code=(scene, links))
     return _RECORDERS.of(key, lambda: compiled(functools.partial(_record, scene, links, image)))
 
 

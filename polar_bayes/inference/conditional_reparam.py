@@ -79,10 +79,7 @@ class ConditionalReparam:
 
     def potential(self, x: Float[Array, " size"], given: ConditionalInputs) -> Float[Array, ""]:
         """Minus the log density of x, up to a constant."""
-        start = self._start(x, given.point)
-        x, log_volume = self._summands(x, given)
-        w, of_coefficients = self._coefficients(x, start, given)
-        log_volume = log_volume + of_coefficients
+        x, w, log_volume = self._moved(x, given)
         # Not of one flat vector: the optics, which depend on other sites only, are then found to be
         # the same as in the Gauss-Newton step, and computed once.
         sites = self.program.unravel(x) | self._by_name(w)
@@ -92,10 +89,8 @@ class ConditionalReparam:
         self, x: Float[Array, " size"], given: ConditionalInputs
     ) -> tuple[Float[Array, " size"], Float[Array, ""]]:
         """Coordinates of the program, and the log volume of the map."""
-        start = self._start(x, given.point)
-        x, log_volume = self._summands(x, given)
-        w, of_coefficients = self._coefficients(x, start, given)
-        return x.at[self.coefficients].set(w), log_volume + of_coefficients
+        x, w, log_volume = self._moved(x, given)
+        return x.at[self.coefficients].set(w), log_volume
 
     def backward(self, z: np.ndarray, data: Observations) -> np.ndarray:
         """Coordinates x of vectors of the program, (row, size), their coefficients standard 0."""
@@ -104,13 +99,6 @@ class ConditionalReparam:
         x = np.array(z)
         x[:, self.coefficients] = 0.0
         return x
-
-    def _summands(
-        self, x: Float[Array, " size"], given: ConditionalInputs
-    ) -> tuple[Float[Array, " size"], Float[Array, ""]]:
-        if self.sums is None:
-            return x, jnp.zeros((), x.dtype)
-        return self.sums.forward(x, given.data)
 
     @functools.cached_property
     def potential_jit(self) -> Callable[[Array, ConditionalInputs], Array]:
@@ -159,21 +147,17 @@ class ConditionalReparam:
         slope = jnp.zeros((count, len(self.others)), dtype)
         return ConditionalInputs(ModeRegression(others, jnp.zeros(count, dtype), slope), data)
 
-    def _start(
-        self, x: Float[Array, " size"], point: ModeRegression
-    ) -> Float[Array, " coefficient"]:
-        return point.coefficients + point.slope @ (x[self.others] - point.others)
-
-    def _coefficients(
-        self,
-        x: Float[Array, " size"],
-        start: Float[Array, " coefficient"],
-        given: ConditionalInputs,
-    ) -> tuple[Float[Array, " coefficient"], Float[Array, ""]]:
-        """The coefficients, and the log volume of the map."""
+    def _moved(
+        self, x: Float[Array, " size"], given: ConditionalInputs
+    ) -> tuple[Float[Array, " size"], Float[Array, " coefficient"], Float[Array, ""]]:
+        """Other coordinates of the program, the coefficients, and the log volume of the map."""
+        point, noise, volume = given.point, x[self.coefficients], jnp.zeros((), x.dtype)
+        start = point.coefficients + point.slope @ (x[self.others] - point.others)
+        if self.sums is not None:
+            x, volume = self.sums.forward(x, given.data)
         mean, lower = self._conditional(x, start, given)
-        noise = solve_triangular(lower, x[self.coefficients], trans=1, lower=True)
-        return mean + noise, -jnp.sum(jnp.log(jnp.diagonal(lower)))
+        w = mean + solve_triangular(lower, noise, trans=1, lower=True)
+        return x, w, volume - jnp.sum(jnp.log(jnp.diagonal(lower)))
 
     def _conditional(
         self,
