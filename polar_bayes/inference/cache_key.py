@@ -25,9 +25,9 @@ def cache_key(
         (name, jax.tree.leaves(prior), str(jax.tree.structure(prior)))
         for name, prior in priors.items()
     ]
+    scene = dataclasses.replace(scene)  # without its ledger
     code = (model, scene, links, *map(type, priors.values()))
-    plain = dataclasses.replace(scene)  # without its ledger
-    return fingerprint(model, plain, stated, links, *further, code=code)
+    return fingerprint(model, scene, stated, links, *further, code=code)
 
 
 def layout_of(data: Observations) -> tuple[str, ...]:
