@@ -288,8 +288,8 @@ def _fit_facts(calibration: xr.DataTree) -> dict[str, str]:
         draws = draws[np.isfinite(draws)]
         if draws.size:
             low, middle = np.quantile(draws, [0.05, 0.5])
-            facts["effective draws: 5% of the fits have fewer than"] = f"{low:.0f}"
-            facts["effective draws: median"] = f"{middle:.0f}"
+            facts["effective sample size: 5% of the fits have less than"] = f"{low:.0f}"
+            facts["effective sample size: median"] = f"{middle:.0f}"
     if "pareto_k" in fits:
         k = fits["pareto_k"].dropna("simulation").to_numpy()
         above = int(np.sum(k > MAX_PARETO_K))
