@@ -10,10 +10,10 @@ ROOT = Path(__file__).parents[1]
 
 CODE = {
     "benchmark": 588,
-    "calibration": 1068,
+    "calibration": 1075,
     "capture": 783,
     "cli": 1124,
-    "design": 1068,
+    "design": 1071,
     "diagnostics": 1689,
     "importers": 1159,
     "inference": 2774,
@@ -31,11 +31,11 @@ CODE = {
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 23430,
+    "code": 23440,
     "classes": 333,
     "constants": 418,
-    "Any": 168,
-    "longest function": 116,
+    "Any": 172,
+    "longest function": 80,
 }
 """Of the package, at most so many; of `longest function` the lines."""
 

@@ -106,56 +106,67 @@ def calibrate(
             process is writing it.
     """
     start = time.perf_counter()
+    _check_size(simulations, store, resume)
+    asked = {"model": model, "scene": scene, "priors": priors, "links": links}
+    requests = _requests(capture, asked, truth or {}, largest_view_zenith, seed)
+    settings = find_method(FIT_DEFAULT if method is None else method, "calibrate", many=True)
+    plan = make_plan(*requests, settings, readings)
+    forecast, folder = Forecast(plan), None if store is None else as_path(store, "store")
+    with contextlib.nullcontext() if folder is None else open_store(folder, plan, resume) as blocks:
+        tree, found = _fit_all(plan, simulations, blocks, scheduler, progress, forecast)
+    stated = _provenance(plan, truth or {}, simulations, forecast.sentence, found)
+    stated["seconds"] = round(time.perf_counter() - start, 3)
+    tree.attrs[PROVENANCE] = json.dumps(stated, sort_keys=True)
+    return tree
+
+
+def _check_size(simulations: int, store: object, resume: bool) -> None:
+    """Raise FitError for too few simulations, or where there is nothing to resume."""
     if resume and store is None:
-        raise FitError(
-            "there is no store to go on with", where="calibrate: resume", hint="give store="
-        )
+        what = "there is no store to go on with"
+        raise FitError(what, where="calibrate: resume", hint="give store=")
     if simulations < MIN_SIMULATIONS:
         hint = f"give {MIN_SIMULATIONS} or more"
         raise FitError(f"simulations is {simulations}", where="calibrate", hint=hint)
-    arguments = {"model": model, "scene": scene, "priors": priors, "links": links}
-    if unknown := set(truth or {}) - set(arguments):
+
+
+def _requests(
+    capture: xr.Dataset,
+    asked: dict[str, Any],
+    truth: Mapping[str, Any],
+    largest_view_zenith: float | None,
+    seed: int,
+) -> tuple[Request, Request | None]:
+    """That of the fits, and that of the data where they are simulated by another."""
+    if unknown := set(truth) - set(asked):
         what = f"{', '.join(sorted(unknown))} cannot differ"
-        raise FitError(what, where="calibrate: truth", hint=f"give some of {', '.join(arguments)}")
+        raise FitError(what, where="calibrate: truth", hint=f"give some of {', '.join(asked)}")
 
-    def resolved(differing: Mapping[str, Any]) -> Request:
-        model, scene, priors, links = {**arguments, **differing}.values()
-        limit = largest_view_zenith
-        return resolve(capture, model, scene, priors, links, limit, seed, "double")
+    def resolved(arguments: dict[str, Any]) -> Request:
+        model, scene, priors, links = arguments.values()
+        return resolve(capture, model, scene, priors, links, largest_view_zenith, seed, "double")
 
-    request = resolved({})
-    settings = find_method(FIT_DEFAULT if method is None else method, "calibrate", many=True)
-    plan = make_plan(request, resolved(truth) if truth else None, settings, readings)
-    if not plan.compiled.shared:
-        what = "the data-generating model and the fitted model share no parameter"
-        hint = "give models whose parameters have the same names and shapes"
-        raise FitError(what, where="calibrate: truth", hint=hint)
-    folder = None if store is None else as_path(store, "store")
-    forecast = Forecast(plan)
-    with (
-        contextlib.nullcontext()
-        if folder is None
-        else open_store(folder, plan, resume=resume) as blocks
-    ):
-        tree, found = _fit_all(
-            plan, simulations, blocks, scheduler, progress or no_progress, forecast
-        )
-    provenance = {
-        **request.describe(),
-        "calibration": simulations,
-        "method": name_of(settings),
-        "settings": repr(settings),
-        "truth": {name: repr(value) for name, value in (truth or {}).items()},
-        "capture": str(request.capture.attrs.get("name", "capture")),
-        "seconds": round(time.perf_counter() - start, 3),
-        "forecast": forecast.sentence,
+    return resolved(asked), resolved({**asked, **truth}) if truth else None
+
+
+def _provenance(
+    plan: CalibrationPlan, truth: Mapping[str, Any], simulations: int, forecast: str, found: int
+) -> dict[str, Any]:
+    """What a calibration states about how it was made."""
+    optional = {
+        "forecast": forecast,
         "fits found in the store": found,
         "why_not_ranked": plan.compiled.unranked_reason,
     }
-    optional = ("forecast", "fits found in the store", "why_not_ranked")
-    stated = {name: x for name, x in provenance.items() if x or name not in optional}
-    tree.attrs[PROVENANCE] = json.dumps(stated, sort_keys=True)
-    return tree
+    return {
+        **plan.request.describe(),
+        "calibration": simulations,
+        "method": name_of(plan.settings),
+        "settings": repr(plan.settings),
+        "truth": {name: repr(value) for name, value in truth.items()},
+        "capture": str(plan.request.capture.attrs.get("name", "capture")),
+        **{name: value for name, value in optional.items() if value},
+    }
 
 
 def make_plan(
@@ -168,7 +179,12 @@ def make_plan(
     own_key = layout_key(request, request.largest_view_zenith)
     generative_key = "" if generative_request is None else layout_key(generative_request)
     key = tokenize(own_key, generative_key, repr(settings), readings, tokenize(request.capture))
-    return CalibrationPlan(request, generative_request, settings, readings, own_key, key)
+    plan = CalibrationPlan(request, generative_request, settings, readings, own_key, key)
+    if not plan.compiled.shared:
+        what = "the data-generating model and the fitted model share no parameter"
+        hint = "give models whose parameters have the same names and shapes"
+        raise FitError(what, where="calibrate: truth", hint=hint)
+    return plan
 
 
 def _fit_all(
@@ -176,7 +192,7 @@ def _fit_all(
     simulations: int,
     store: BlockStore | None,
     scheduler: str | None,
-    progress: Counter,
+    progress: Counter | None,
     forecast: "Forecast",
 ) -> tuple[xr.DataTree, int]:
     """The groups of a calibration, and how many of its fits were in the store."""
@@ -192,7 +208,7 @@ def _fit_all(
                 store.add(block)
             blocks.append(block)
             done += len(numbers_of(block))
-            progress(done, simulations)
+            (progress or no_progress)(done, simulations)
             forecast.see(block, simulations - done)
     return join(blocks, simulations), found
 

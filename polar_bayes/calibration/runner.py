@@ -349,7 +349,7 @@ LIBRARIES = ("polar_bayes", "jax", "jaxlib", "numpyro", "numpy", "scipy")
 
 
 @contextlib.contextmanager
-def open_store(folder: Path, plan: CalibrationPlan, *, resume: bool) -> Iterator["BlockStore"]:
+def open_store(folder: Path, plan: CalibrationPlan, resume: bool) -> Iterator["BlockStore"]:
     """The blocks of a calibration in a folder, which is made, or read where it is resumed."""
     where = str(folder)
     if not resume and folder.exists():

@@ -159,11 +159,8 @@ def next_views(
     """
     _check_choice(count, draws, apart)
     if isinstance(capture, xr.DataTree):
-        asked = arguments_of(capture)
-        model, scene = asked.get("model", model), scene or asked.get("scene")
-        priors, links = priors or asked.get("priors"), links or asked.get("links")
-        if largest_view_zenith is None:
-            largest_view_zenith = asked.get("largest_view_zenith")
+        asked = _asked_of(capture, model, scene, priors, links, largest_view_zenith)
+        model, scene, priors, links, largest_view_zenith = asked
         result, capture = result or capture, capture_of(capture)
     request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, "double")
     with jax.enable_x64(True):
@@ -174,6 +171,15 @@ def next_views(
         drawn = posterior_draws(problem, result, draws, progress)
         design = _design(problem, extended, views, drawn, tuple(new), tuple(apart))
         return _selected(extended, views, design, criterion, constraints, count)
+
+
+def _asked_of(fit: xr.DataTree, model: str | Callable, *others: object) -> tuple:
+    """The model of a fit, and what it was asked for besides where nothing else is given."""
+    stated = arguments_of(fit)
+    names = ("scene", "priors", "links", "largest_view_zenith")
+    given = dict(zip(names, others, strict=True))
+    kept = (stated.get(name) if given[name] is None else given[name] for name in names)
+    return stated.get("model", model), *kept
 
 
 def _check_choice(count: object, draws: int, apart: Sequence[str]) -> None:
