@@ -237,6 +237,7 @@ def _extended(
     request = resolve(views.capture, model, scene, priors, links, limit, seed, "double")
     data = observe_request(request)
     recorded = np.broadcast_to(problem.data.brightness, problem.data.shape)
+    recorded = recorded[..., : views.measured]
     rest = np.full((*data.shape[:-1], data.shape[-1] - views.measured), np.median(recorded))
     brightness = jax.device_put(np.concatenate([recorded, rest], axis=-1))
     data = dataclasses.replace(data, brightness=brightness)

@@ -17,7 +17,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.compiled_model import CompiledModel, compile_model
 from polar_bayes.inference.initialization import AbstractInit
 from polar_bayes.inference.program import Draw, Program, Values, in_blocks, keys_of_draws
-from polar_bayes.inference.request import Request
+from polar_bayes.inference.request import Request, is_padded
 from polar_bayes.numerics.compile import TRACING_LOCK
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.priors import RANGES, describe_prior, support_bounds
@@ -116,7 +116,7 @@ class Problem:
             rows[name] = [dims, int(np.prod(value.shape)), text, low, high]
         columns = ["dims", "size", "prior", "low", "high"]
         table = pd.DataFrame.from_dict(rows, orient="index", columns=columns)
-        valid = np.asarray(self.data.valid)
+        valid = np.asarray(self.data.valid)[..., self.data.measured]
         table.attrs["used"] = dict.fromkeys(program.observed, int(valid.sum()))
         table.attrs["measured"] = dict.fromkeys(program.observed, valid.size)
         return table
@@ -199,15 +199,16 @@ class Problem:
         return jax.tree.map(lambda x: x.reshape(*z.shape[:2], *x.shape[1:]), found)
 
 
-def observe_request(request: Request) -> Observations:
+def observe_request(request: Request, *, padded: bool = False) -> Observations:
     """The capture of a request, in its precision."""
-    data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
+    limit = request.largest_view_zenith
+    data = observe(request.capture, largest_view_zenith=limit, padded=padded)
     return data.in_single_precision() if request.precision == "single" else data
 
 
 def compile_request(request: Request) -> tuple[CompiledModel, Observations]:
     """The compiled model of a request, from the cache, and its capture."""
-    data = observe_request(request)
+    data = observe_request(request, padded=is_padded(request.model, request.scene, request.links))
     compiled_model = compile_model(request, data)
     return compiled_model, compiled_model.free(data)
 

@@ -19,6 +19,7 @@ from polar_bayes.models.gp_spectral import gp_spectral
 from polar_bayes.models.hierarchical import Hierarchical
 from polar_bayes.models.per_material import per_material
 from polar_bayes.numerics.compile import TRACING_LOCK, LRUCache
+from polar_bayes.numerics.fingerprint import uses_own_code
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
@@ -105,6 +106,12 @@ def _run(
     model(data, scene=scene, priors={**priors, **shared}, links=links)
 
 
+def is_padded(model: Callable, scene: Scene, links: Mapping[str, AbstractLink]) -> bool:
+    """Whether captures with other numbers of views may share the programs of a model."""
+    # Code of the user's own need not mask what is not valid, so it is given no padding.
+    return not uses_own_code(model, scene, links)
+
+
 def resolve(
     capture: xr.Dataset,
     model: str | Callable,
@@ -148,7 +155,8 @@ def resolve(
         own = {name: prior for name, prior in stated.items() if name not in same}
         stated = {**usual, **own, **same}
     with jax.enable_x64(precision == "double"):
-        data = observe(capture, largest_view_zenith=limit)
+        padded = is_padded(function, setup.scene, chosen)
+        data = observe(capture, largest_view_zenith=limit, padded=padded)
         found = _inspect(function, data, setup.scene, stated, chosen)
     swapped = {
         "scene": scene_name == "custom",

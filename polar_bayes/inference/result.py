@@ -42,17 +42,17 @@ def assemble(
     groups: dict[str, dict[str, np.ndarray]] = {
         "posterior": _shaped(program, posterior.parameters),
         "sample_stats": {name: np.asarray(x) for name, x in sample_stats.items()},
-        "posterior_predictive": _readings(posterior.predictive, data),
-        "log_likelihood": {n: np.asarray(x) for n, x in posterior.log_likelihood.items()},
-        "noise_free": _readings(posterior.center, data),
+        "posterior_predictive": _in_own_unit(posterior.predictive, data),
+        "log_likelihood": _measured(posterior.log_likelihood, data),
+        "noise_free": _in_own_unit(posterior.center, data),
         "prior": _shaped(program, prior.parameters),
-        "prior_predictive": _readings(prior.predictive, data),
+        "prior_predictive": _in_own_unit(prior.predictive, data),
     }
     if program.auxiliary:
         groups["unconstrained_posterior"] = _shaped(program, posterior.coordinates)
     coords = {
-        dim: capture[dim].to_numpy() if dim in capture.coords else np.arange(length)
-        for dim, length in data.dims
+        dim: capture[dim].to_numpy() if dim in capture.coords else np.arange(capture.sizes[dim])
+        for dim, _ in data.dims
     }
     tree = from_dict(groups, coords=coords, dims=dims_of(program))
     # The log prior is one number per site and draw, whatever the site's own axes are.
@@ -141,9 +141,15 @@ def _shaped(program: Program, values: Values) -> dict[str, np.ndarray]:
     }
 
 
-def _readings(values: Values, data: Observations) -> dict[str, np.ndarray]:
+def _measured(readings: Values, data: Observations) -> dict[str, np.ndarray]:
+    """Readings of draws, or their densities, without those of padding."""
+    return {name: np.asarray(value)[..., data.measured] for name, value in readings.items()}
+
+
+def _in_own_unit(readings: Values, data: Observations) -> dict[str, np.ndarray]:
+    """Readings of draws in the unit of the capture."""
     unit = {"intensity": float(data.intensity_unit)}
-    return {name: np.asarray(value) * unit.get(name, 1.0) for name, value in values.items()}
+    return {name: x * unit.get(name, 1.0) for name, x in _measured(readings, data).items()}
 
 
 def _data_groups(
@@ -153,7 +159,8 @@ def _data_groups(
     order = [dim for dim, _ in data.dims]
     bare = capture.drop_vars(capture.coords)
     valid, saturated = (
-        xr.DataArray(np.asarray(flag), dims=order) for flag in (data.valid, data.saturated)
+        xr.DataArray(np.asarray(flag)[..., data.measured], dims=order)
+        for flag in (data.valid, data.saturated)
     )
     readings = [name for name in program.observed if name in bare]
     given = [n for n in bare if str(n).startswith("true_") or str(n).endswith("_error")]

@@ -24,6 +24,11 @@ def fingerprint(*parts: object, code: Iterable[object]) -> str:
     return tokenize([tokenize(part) for part in (*map(_plain, parts), *_code_of(*code))])
 
 
+def uses_own_code(*roots: object) -> bool:
+    """Whether some function that the roots refer to is the user's own."""
+    return any(isinstance(each, CodeType) for each in _code_of(*roots))
+
+
 CONSTANTS = (str, bytes, int, float, complex, np.ndarray, np.generic, jax.Array)
 
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from polar_bayes.physics.geometry import Geometry
 
@@ -36,6 +36,8 @@ class Observations(eqx.Module):
             that other pixels determine too; they replace the priors of those names.
         held: Values of latent sites that are not estimated, in their supports, NaN where one is;
             a site that is not among them is estimated.
+        views: How many views the capture has; those beyond are padding, never valid. None where
+            there is no padding.
     """
 
     geometry: Geometry
@@ -52,6 +54,7 @@ class Observations(eqx.Module):
         default_factory=dict
     )
     held: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
+    views: Int[Array, ""] | None = None
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -63,20 +66,40 @@ class Observations(eqx.Module):
         """Names and lengths of the axes of materials, patches or pixels."""
         return tuple(axis for axis in self.dims if axis[0] not in ("wavelength", "view"))
 
+    @property
+    def measured(self) -> slice:
+        """The views of the capture, along the last axis."""
+        return slice(None if self.views is None else int(self.views))
+
     def in_single_precision(self) -> "Observations":
         """The same readings as 32-bit numbers; masks stay masks."""
         return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, self)
 
 
+def padded_length(views: int) -> int:
+    """The number of views that programs are compiled for: 8, 12, 16, 24, 32, 48, 64, ..."""
+    power = max(8, 1 << (views - 1).bit_length())
+    between = 3 * power // 4
+    return between if 8 < between and views <= between else power
+
+
 def observe(
-    capture: xr.Dataset, *, largest_view_zenith: float = 90.0, intensity_unit: float | None = None
+    capture: xr.Dataset,
+    *,
+    largest_view_zenith: float = 90.0,
+    intensity_unit: float | None = None,
+    padded: bool = False,
 ) -> Observations:
-    """Turn a validated capture into the arrays of a model."""
+    """Turn a validated capture into the arrays of a model, padded to `padded_length` if asked."""
+    views = capture.sizes["view"]
+    if padded:  # by the last view again, whose directions are possible ones
+        capture = capture.isel(view=np.minimum(np.arange(padded_length(views)), views - 1))
     names = [name for name in READINGS if name in capture]
     order = _axis_order(capture[names[0]])
     measured = np.asarray(_values(capture, "valid", order, default=True), bool)
     largest, full_scale = _intensity_range(capture, order, measured, intensity_unit)
     valid = measured & (_values(capture, "view_zenith", order) <= largest_view_zenith)
+    valid = valid & (np.arange(capture.sizes["view"]) < views)
     saturated = np.asarray(_values(capture, "saturated", order, default=False), bool)
     if np.isfinite(full_scale):  # a reading at full scale is censored, flagged or not
         saturated = saturated | (_values(capture, "intensity", order) >= full_scale)
@@ -110,6 +133,7 @@ def observe(
         "valid": valid,
         "saturated": saturated,
         "confidence": confidence,
+        "views": np.int32(views) if padded else None,
     }
     return Observations(
         geometry=Geometry.from_degrees(**angles),
