@@ -66,9 +66,14 @@ def result_of(name: str, fitted: dict[str, xr.DataTree]) -> xr.DataTree:
     return fitted[name]
 
 
+def draw(plot: str, result: xr.DataTree) -> arviz_plots.PlotCollection:
+    plt.close("all")
+    return getattr(arviz_plots, plot)(result)
+
+
 @each("plot", OF_DRAWS)
 def test_arviz_draws_what_chains_found(plot: str, fitted) -> None:
-    drawn = getattr(arviz_plots, plot)(result_of("nuts", fitted))
+    drawn = draw(plot, result_of("nuts", fitted))
     assert drawn.viz["figure"].item().get_axes()
 
 
@@ -76,14 +81,14 @@ def test_arviz_draws_what_chains_found(plot: str, fitted) -> None:
 @each("name", ["laplace", "importance"])
 @each("plot", OF_DRAWS)
 def test_arviz_draws_the_draws_of_other_methods(name: str, plot: str, fitted) -> None:
-    drawn = getattr(arviz_plots, plot)(result_of(name, fitted))
+    drawn = draw(plot, result_of(name, fitted))
     assert drawn.viz["figure"].item().get_axes()
 
 
 @pytest.mark.thorough
 @each("plot", OF_AN_ESTIMATE)
 def test_arviz_draws_an_estimate(plot: str, fitted) -> None:
-    assert getattr(arviz_plots, plot)(result_of("point", fitted))
+    assert draw(plot, result_of("point", fitted))
 
 
 def test_arviz_sums_it_up(fitted) -> None:
