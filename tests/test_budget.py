@@ -16,7 +16,7 @@ CODE = {
     "design": 1072,
     "diagnostics": 1689,
     "importers": 1159,
-    "inference": 2781,
+    "inference": 2798,
     "maps": 1734,
     "methods": 1252,
     "numerics": 884,
@@ -26,13 +26,13 @@ CODE = {
     "scenes": 1666,
     "own files": 1478,
     "models": 320,
-    "tests": 22782,
+    "tests": 22785,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 23467,
-    "classes": 333,
+    "code": 23484,
+    "classes": 335,
     "constants": 418,
     "Any": 172,
     "longest function": 80,

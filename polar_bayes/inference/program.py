@@ -4,12 +4,13 @@ Methods use sites and shapes, never a parameter by name. The data are an argumen
 so that fits to captures of one layout share their compiled programs.
 """
 
+import contextlib
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, override
 
 import jax
 import jax.numpy as jnp
@@ -58,9 +59,10 @@ class Draw(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Program:
-    """A model conditioned on data of one layout."""
+    """A model conditioned on data of one layout; `prior` is the model without its readings."""
 
     model: Model
+    prior: Model
     dims: Mapping[str, tuple[str, ...]]
     plates: Mapping[str, int]
     events: Mapping[str, tuple[int, ...]]
@@ -83,8 +85,7 @@ class Program:
 
     def prior_potential(self, z: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
         """The potential without the likelihood."""
-        prior = handlers.block(self.model, hide=list(self.observed))
-        return -_total(self._log_terms(prior, self.unravel(z), data)[0], data)
+        return -_total(self._log_terms(self.prior, self.unravel(z), data)[0], data)
 
     def constrain(self, z: Float[Array, " size"]) -> dict[str, Array]:
         """The latent sites in their supports."""
@@ -151,13 +152,15 @@ class Program:
 
     def trace_at(self, sites: dict[str, Array], data: Observations) -> dict[str, dict]:
         """The same of the unconstrained latent sites by name."""
+        return self._trace(self.model, sites, data)
+
+    def _trace(self, model: Model, sites: dict[str, Array], data: Observations) -> dict[str, dict]:
         values = _with_held(self._constrain(sites), data)
-        fixed = handlers.substitute(self.model, data=values)
-        return _trace(fixed, jax.random.key(0), data)
+        return _trace(handlers.substitute(model, data=values), jax.random.key(0), data)
 
     def parameters(self, z: Float[Array, " size"], data: Observations) -> dict[str, Array]:
         """The parameters: latent sites that are not auxiliary, and what derives from them."""
-        return self._parameters(self.trace(z, data))
+        return self._parameters(self._trace(self.prior, self.unravel(z), data))
 
     def parameters_and_potential(
         self, z: Float[Array, " size"], data: Observations
@@ -172,7 +175,7 @@ class Program:
 
     def from_prior(self, key: Array, data: Observations) -> Float[Array, " size"]:
         """An unconstrained vector drawn from the prior."""
-        trace = _trace(self.model, key, data)
+        trace = _trace(self.prior, key, data)
         return self.unconstrain({name: trace[name]["value"] for name in self.supports})
 
     def describe(
@@ -276,7 +279,7 @@ class Program:
         """Potentials and parameters of some vectors, (row, size), compiled."""
 
         def evaluate(z: Array, data: Observations) -> tuple[Array, dict[str, Array]]:
-            return jax.lax.map(lambda z: (self.potential(z, data), self.parameters(z, data)), z)
+            return jax.lax.map(lambda z: self.parameters_and_potential(z, data)[::-1], z)
 
         return JitOnce(evaluate)
 
@@ -337,15 +340,39 @@ def _raveled(like: dict[str, jax.ShapeDtypeStruct]) -> tuple[jax.ShapeDtypeStruc
     return jax.eval_shape(flat, like), functions[0]
 
 
+class _EndedError(BaseException):
+    """Ends a model; no handler of errors in it is to see this."""
+
+
+class _UpTo(Messenger):
+    """Ends a model at the last of some sites, before it computes what comes after them."""
+
+    def __init__(self, sites: Iterable[str]) -> None:
+        super().__init__()
+        self._left = set(sites)
+
+    @override
+    def postprocess_message(self, msg: Site) -> None:
+        self._left.discard(msg.get("name", ""))
+        if not self._left:
+            raise _EndedError
+
+
+def _run_up_to(data: Observations, model: Model, sites: frozenset[str]) -> None:
+    """A model up to the last of some sites."""
+    with contextlib.suppress(_EndedError), _UpTo(sites):
+        model(data)
+
+
 def compile_program(model: Model, data: Observations) -> Program:
     """Trace the model once with abstract arrays, and record its sites."""
     sites, sampled, latent = _abstract_sites(model, data)
     observed = tuple(n for n, site in sampled.items() if site["is_observed"] and n in data.readings)
+    of_readings = {*observed, *(f"{reading}_mean" for reading in observed)}
     derived = {
         name: site
         for name, site in sites.items()
-        if site["type"] == "deterministic"
-        and name not in {f"{reading}_mean" for reading in observed}
+        if site["type"] == "deterministic" and name not in of_readings
     }
     supports = {name: site["fn"].support for name, site in latent.items()}
     prototype = {
@@ -356,6 +383,9 @@ def compile_program(model: Model, data: Observations) -> Program:
     plates = {name: site["cond_indep_stack"] for name, site in (sampled | derived).items()}
     return Program(
         model=model,
+        prior=functools.partial(
+            _run_up_to, model=model, sites=frozenset({*sampled, *derived} - of_readings)
+        ),
         dims={
             name: tuple(frame.name for frame in sorted(frames, key=lambda frame: frame.dim))
             for name, frames in plates.items()
