@@ -26,7 +26,7 @@ CODE = {
     "scenes": 1666,
     "own files": 1478,
     "models": 320,
-    "tests": 22785,
+    "tests": 22815,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 

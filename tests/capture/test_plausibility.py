@@ -168,6 +168,7 @@ def test_more_than_full_polarization_is_cautioned_where_errors_forbid_it(error, 
     assert not cautious or "4 of 4 readings have sqrt(q^2 + u^2) above 1" in said[0]
 
 
+@pytest.mark.thorough
 @settings(max_examples=25, deadline=None)
 @given(
     scene=st.sampled_from(list(pb.setups.SETUPS)),

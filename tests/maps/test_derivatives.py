@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from cases import each
+from numpyro import distributions as dist
 from numpyro import handlers
 from plate_images import ASKED, plate_image
 from plates import PLATE
@@ -22,6 +23,12 @@ from polar_bayes.models.per_material import per_material
 from polar_bayes.observation.data import Observations, observe
 
 pytestmark = pytest.mark.usefixtures("compiled_in_haste")
+
+
+PRIORS = {
+    "subsurface_fraction": dist.Beta(2.0, 2.0),
+    "refractive_index": dist.TruncatedNormal(1.45, 0.15, low=1.2, high=2.0),
+}
 
 
 class Case(NamedTuple):
@@ -78,7 +85,7 @@ EVERY = [
 def case(name: str) -> Case:
     build, size = CASES[name]
     capture, asked = build()
-    request = resolve(capture, asked["model"], PLATE, None, asked["links"], None, 0, "double")
+    request = resolve(capture, asked["model"], PLATE, PRIORS, asked["links"], None, 0, "double")
     data = observe(request.capture)
     program = compile_program(request.bind(PLATE), data)
     assert program.size == size
@@ -134,7 +141,7 @@ def test_scoring_has_the_same_value_and_gradient(name: str) -> None:
 
 
 def prior(z: dict[str, jax.Array]) -> jax.Array:
-    """Beta(2, 2) of the fraction and the bounded normal of the index, on unconstrained lines."""
+    """`PRIORS`, and that of the noise, on unconstrained lines, up to a constant."""
     fraction = jax.nn.sigmoid(z["subsurface_fraction"])
     share = jax.nn.sigmoid(z["refractive_index"])
     index = 1.2 + 0.8 * share
@@ -194,11 +201,10 @@ def test_scoring_of_noise_of_unknown_scale_bends_in_both_arguments() -> None:
 
 @pytest.mark.thorough
 def test_single_precision_stays_single() -> None:
-    here = case("known noise")
-    data = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, here.data)
     with jax.enable_x64(False):
+        here = case.__wrapped__("known noise")
         found = jax.jit(functools.partial(scoring_derivatives, here.program))(
-            np.float32(here.points[0]), data
+            np.float32(here.points[0]), here.data
         )
     assert {leaf.dtype for leaf in found} == {np.dtype(np.float32)}
     assert all(np.isfinite(leaf).all() for leaf in found)

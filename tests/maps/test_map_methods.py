@@ -50,7 +50,9 @@ class OneByOne(pb.methods.Importance):
     run_batch = AbstractMethod.run_batch
 
 
-@pytest.mark.parametrize("kind", [OneByOne, pb.methods.Importance])
+@pytest.mark.parametrize(
+    "kind", [pytest.param(OneByOne, marks=pytest.mark.thorough), pb.methods.Importance]
+)
 def test_importance_sampling_makes_a_map(image: xr.Dataset, kind: type) -> None:
     method = kind(draws=1024)
     some = image.isel(y=[0, 1], x=[0, 1])

@@ -132,6 +132,7 @@ def test_a_setup_says_what_its_images_share(
     assert not pb.maps.shared_cautions(found)
 
 
+@pytest.mark.thorough
 def test_pixels_keep_their_own_where_nothing_should_be_shared(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

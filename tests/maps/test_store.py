@@ -63,6 +63,7 @@ def journal_of(store: Path) -> Path:
     return store.with_name(f"{store.name}.progress")
 
 
+@pytest.mark.thorough
 def test_a_store_is_begun_without_holding_the_maps_in_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

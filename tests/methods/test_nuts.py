@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import polar_bayes as pb
 from polar_bayes.inference.initialization import Target
@@ -70,6 +71,7 @@ def funnel(z: jax.Array, scale: jax.Array) -> jax.Array:
     return 0.5 * (z[0] / scale) ** 2 + 0.5 * jnp.sum(z[1:] ** 2) * jnp.exp(-z[0]) + z[0]
 
 
+@pytest.mark.thorough
 def test_where_draws_diverge_it_changes_nothing_either() -> None:
     """Chains are redone after the same draws, whether a block holds one or all of them."""
     told = []

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxtyping import Array
@@ -318,9 +319,8 @@ def test_materials_broadcast_against_views() -> None:
     np.testing.assert_allclose(few, many, rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.thorough)]
-)
+@pytest.mark.thorough
+@each("dtype", [np.float32, np.float64])
 def test_value_gradient_and_hessian_are_finite(dtype: type) -> None:
     """At both ends of every input, together; a Hessian times a vector hides nothing.
 

@@ -61,6 +61,7 @@ def test_the_second_bounce_is_that_of_a_height_field(height_field_sky: np.ndarra
     assert np.all(error <= 0.1 * added[strong] + 3.0 * rows[strong, 7:9])
 
 
+@pytest.mark.thorough
 @each("distribution", [Beckmann(), GGX()])
 @each("roughness", [0.1, 0.3, 0.5])
 def test_no_light_is_made(distribution, roughness) -> None:

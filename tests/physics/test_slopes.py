@@ -144,6 +144,7 @@ def test_sky_and_way_out_agree_with_brute_force(name: str) -> None:
             assert np.all(np.abs(light.u - u / total) <= polarized)
 
 
+@pytest.mark.thorough
 @each("name", DISTRIBUTIONS)
 def test_the_default_serves_steep_grooves_from_any_side(name: str) -> None:
     """A slope ratio of 20, where nodes in the viewer's frame were off by .07 in q and u."""

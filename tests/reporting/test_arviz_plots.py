@@ -22,21 +22,20 @@ METHODS = {
     "importance": pb.methods.Importance(),
     "point": pb.methods.Point(starts=2),
 }
+FIRST = ("plot_forest", "plot_ppc_pit", "plot_loo_pit", "plot_psense_dist", "plot_rank")
+"""One of each group that a plot reads."""
+
 OF_DRAWS = (
     "plot_dist",
-    "plot_forest",
     "plot_pair",
     "plot_ppc_dist",
     "plot_ppc_interval",
-    "plot_ppc_pit",
-    "plot_loo_pit",
     "plot_prior_posterior",
-    "plot_psense_dist",
     "plot_trace",
     "plot_trace_dist",
     "plot_autocorr",
     "plot_ess",
-    "plot_rank",
+    *FIRST,
 )
 OF_AN_ESTIMATE = ("plot_dist", "plot_forest", "plot_pair", "plot_ppc_interval", "plot_trace_dist")
 
@@ -71,16 +70,16 @@ def draw(plot: str, result: xr.DataTree) -> arviz_plots.PlotCollection:
     return getattr(arviz_plots, plot)(result)
 
 
-@each("plot", OF_DRAWS)
+@each("plot", FIRST)
 def test_arviz_draws_what_chains_found(plot: str, fitted) -> None:
     drawn = draw(plot, result_of("nuts", fitted))
     assert drawn.viz["figure"].item().get_axes()
 
 
 @pytest.mark.thorough
-@each("name", ["laplace", "importance"])
+@each("name", ["nuts", "laplace", "importance"])
 @each("plot", OF_DRAWS)
-def test_arviz_draws_the_draws_of_other_methods(name: str, plot: str, fitted) -> None:
+def test_arviz_draws_the_draws_of_every_method(name: str, plot: str, fitted) -> None:
     drawn = draw(plot, result_of(name, fitted))
     assert drawn.viz["figure"].item().get_axes()
 

@@ -161,6 +161,7 @@ def test_what_is_no_scene_is_refused(capture: xr.Dataset) -> None:
         pb.fit(capture, scene="auto", method="point")
 
 
+@pytest.mark.thorough
 def test_bodies_are_compared_at_once_and_a_worse_surface_not_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -130,6 +130,7 @@ def absorbing_body() -> xr.DataTree:
     return _fit("leaf", "camera", subsurface=pb.physics.Depolarizer())
 
 
+@pytest.mark.thorough
 def test_a_body_that_may_absorb_is_told_with_the_answer_it_gives(absorbing_body) -> None:
     """The readings do not tell it from a white one, whose fraction is tens of sds off."""
     row = criticize(absorbing_body).loc["alternatives"]
@@ -149,6 +150,7 @@ def test_a_body_that_is_not_there_has_no_alternative() -> None:
     assert "Depolarizer" in set(alternatives(fit)["alternative"])  # compared, and no news
 
 
+@pytest.mark.thorough
 def test_roughness_of_another_distribution_is_not_the_same_quantity(absorbing_body) -> None:
     table = alternatives(absorbing_body)
     slopes = table[table["alternative"] == "GGX"]
