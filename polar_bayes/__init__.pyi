@@ -17,6 +17,7 @@ from . import setups as setups
 from . import simulation as simulation
 from .benchmark.accuracy import accuracy as accuracy
 from .calibration.calibrate import calibrate as calibrate
+from .capture import input_quantities as input_quantities
 from .capture.files import (
     load_capture as load_capture,
     save_capture as save_capture,
@@ -24,6 +25,7 @@ from .capture.files import (
 from .design.identify import identify as identify
 from .design.next_views import next_views as next_views
 from .design.profile import profile as profile
+from .diagnostics.budget import budget as budget
 from .errors import (
     CaptureError as CaptureError,
     FitError as FitError,

@@ -13,6 +13,17 @@ import pandas as pd
 import xarray as xr
 from numpyro import distributions as dist
 
+from polar_bayes.capture.input_quantities import (
+    AmbientLight,
+    AnalyzerRoll,
+    InputQuantities,
+    LightAzimuth,
+    LightZenith,
+    PolarizationGain,
+    SampleLean,
+    ToneCurve,
+    ViewZenithScale,
+)
 from polar_bayes.errors import SceneError
 from polar_bayes.frames import PrintedFrame
 from polar_bayes.observation.links import AbstractLink, BetaLink, StokesLink, StudentTLink
@@ -40,6 +51,7 @@ class Setup(HTMLRepr):
         largest_view_zenith: Views beyond it are set aside and counted. Unit degree.
         priors: Distributions that replace those of `polar_bayes.PRIORS` in this set-up.
         shared: Instrument parameters that the pixels of an image share by default.
+        known: What it is known to, which no reading tells: `pb.budget` propagates it.
     """
 
     scene: Scene
@@ -47,6 +59,7 @@ class Setup(HTMLRepr):
     largest_view_zenith: float = 90.0
     priors: Mapping[str, dist.Distribution] = dataclasses.field(default_factory=dict)
     shared: tuple[str, ...] = ()
+    known: InputQuantities = ()
 
 
 # A bare surface is as common as any body, and where it is one, the index must not follow a fraction
@@ -62,6 +75,16 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
             SCENES["camera"],
             {"q": StokesLink(), "u": StokesLink(), "intensity": StudentTLink()},
             shared=("dolp_gain",),  # one polarizer took the image
+            # A lamp placed by eye, the pose of a printed board, an analyzer set by its mark.
+            known=(
+                LightZenith(1.0),
+                LightAzimuth(1.0),
+                ViewZenithScale(0.005),
+                AnalyzerRoll(0.3),
+                PolarizationGain(0.005),
+                AmbientLight(0.005),
+                ToneCurve(0.01),
+            ),
         ),
         # The irradiance of a pixel is unknown, so brightness carries no information; the noise of
         # every pixel is known.
@@ -70,6 +93,7 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
             {"q": StokesLink(stated_errors=True), "u": StokesLink(stated_errors=True)},
             # A fraction of .009 dilutes the polarization of a mirror by a fifth already.
             priors=MAYBE_BARE,
+            known=(AnalyzerRoll(0.3), PolarizationGain(0.005), ToneCurve(0.01)),
         ),
         # A laser beam grows longer than the sample towards grazing, each channel losing its own
         # share: beyond 78 degrees a plate's readings say more about its size than its index.
@@ -79,6 +103,14 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
             largest_view_zenith=78.0,
             # A plate with an opaque back sends nothing from below: zero must not be an outlier.
             priors={"subsurface_fraction": Beta(1.0, 3.0)},
+            # A rotary stage and a sample against its stop; a photodiode in a dark room.
+            known=(
+                SampleLean(0.2),
+                ViewZenithScale(0.002),
+                PolarizationGain(0.005),
+                AmbientLight(0.002),
+                ToneCurve(0.005),
+            ),
         ),
     }
 )

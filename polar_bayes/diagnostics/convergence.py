@@ -14,6 +14,7 @@ import pandas as pd
 import xarray as xr
 from arviz_stats.base import array_stats
 
+from polar_bayes.diagnostics.budget import budget_sentences
 from polar_bayes.diagnostics.checked import checks_made
 from polar_bayes.diagnostics.criticism import criticize
 from polar_bayes.diagnostics.finding import join, listed
@@ -106,6 +107,7 @@ def verdict(fit: FitView) -> Verdict:
         *against.get("note", []),
         *_chain_notes(fit),
         *_reading_notes(provenance.get("counts", {})),
+        *budget_sentences(fit),
     )
     made, missing = checks_made(method, criticism)
     return Verdict(

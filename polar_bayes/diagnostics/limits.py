@@ -48,6 +48,9 @@ class Limits:
     # Of draws in single precision at the ends of their prior.
     rounding: float = 1e-6
 
+    # Factor by which the set-up widens an interval that is worth a sentence.
+    of_setup: float = 1.25
+
     replicates: int = 1000
     # Readings that the checks use; of more, evenly spaced ones.
     readings: int = 600

@@ -38,7 +38,7 @@ def sensitivity(fit: FitView) -> pd.DataFrame:
     if fit.method == "point":
         return pd.DataFrame(columns=list(COLUMNS))
     groups = ("log_prior", "log_likelihood")
-    weights = [_scaled_weights(_total(fit.result, group)) for group in groups]
+    weights = [_scaled_weights(total_density(fit.result, group)) for group in groups]
     alone = readings_alone(residuals_of(fit))
     rows = []
     for scalar in fit.scalars:
@@ -76,7 +76,7 @@ def _interval(draws: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _total(result: xr.DataTree, group: str) -> np.ndarray | None:
+def total_density(result: xr.DataTree, group: str) -> np.ndarray | None:
     """The sum of a group of log densities, shape (chain, draw)."""
     if group not in result.children or not result[group].data_vars:
         return None

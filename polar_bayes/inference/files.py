@@ -443,6 +443,7 @@ SCENES = Group(
 )
 """The group `scenes`: the comparison behind a fit with scene="auto"."""
 
+_TEXTS = ("unit", "meaning")
 _FLAGS = ("valid", "saturated", "diverging", "reached_max_treedepth")
 _OF_READINGS = Group(DRAWS, tied=True, like=Like("observed_data", {"": DRAWS}))
 FIT = Schema(
@@ -469,6 +470,13 @@ FIT = Schema(
         ),
         "without_discrepancy": Group(DRAWS, labeled=False),
         "without_instrument": Group(DRAWS, labeled=False),
+        "input_shifts": Group(
+            ("statistic", "quantity"),
+            labeled=False,
+            variables=dict.fromkeys(("quantity", "standard_uncertainty", *_TEXTS), ("quantity",))
+            | {"statistic": ("statistic",)},
+            kinds=dict.fromkeys(("statistic", "quantity", *_TEXTS), TEXTS),
+        ),
         "effects": LEDGER,
         "scenes": SCENES,
         "accuracy": ACCURACY,

@@ -121,16 +121,19 @@ class Problem:
         table.attrs["measured"] = dict.fromkeys(program.observed, valid.size)
         return table
 
-    def log_density(self, z: Float[np.ndarray, "draw size"]) -> Float[np.ndarray, " draw"]:
+    def log_density(
+        self, z: Float[np.ndarray, "draw size"], data: Observations | None = None
+    ) -> Float[np.ndarray, " draw"]:
         """Log posterior density of unconstrained vectors, up to a constant.
 
         Args:
             z: Unconstrained vectors, shape (draw, size).
+            data: Another capture of this layout; by default that of the problem.
 
         Returns:
             Log densities, shape (draw,); minus infinity where there is none.
         """
-        return self.program.log_density(z.astype(self.dtype), self.data)
+        return self.program.log_density(z.astype(self.dtype), self.data if data is None else data)
 
     def constrain(self, z: Float[np.ndarray, "chain draw size"]) -> Values:
         """Parameters of draws, in their supports.

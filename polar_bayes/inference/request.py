@@ -10,6 +10,7 @@ import xarray as xr
 from numpyro import distributions as dist
 from numpyro.primitives import Messenger
 
+from polar_bayes.capture.input_quantities import InputQuantities
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.inference.cache_key import cache_key, layout_of
@@ -62,6 +63,8 @@ class Request:
     precision: str
     shared: tuple[str, ...]
     """Parameters of the set-up that the pixels of an image share by default."""
+    known: InputQuantities = ()
+    """What the set-up is known to."""
 
     def bind(self, scene: Scene) -> Callable[[Observations], None]:
         """The model with everything but its data in place."""
@@ -184,6 +187,7 @@ def resolve(
         seed=int(seed),
         precision=precision,
         shared=tuple(name for name in setup.shared if name in found.priors),
+        known=tuple(each for each in setup.known if each.acts_on(capture)),
     )
 
 

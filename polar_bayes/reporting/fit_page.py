@@ -13,6 +13,12 @@ from matplotlib.figure import Figure
 from polar_bayes.benchmark.advice import accuracy_sentences, accuracy_view
 from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.alternatives import alternatives
+from polar_bayes.diagnostics.budget import (
+    INPUT_SHIFTS,
+    budget,
+    budget_sentences,
+    variance_shares,
+)
 from polar_bayes.diagnostics.compare import WITHOUT, compare_without
 from polar_bayes.diagnostics.criticism import QUESTIONS, criticize
 from polar_bayes.diagnostics.limits import LIMITS
@@ -99,6 +105,7 @@ def fit_page(result: xr.DataTree | FitView) -> page.Page:
         Section("population", "Population", _population(fit)),
         Section("spectrum", "Spectrum", _spectrum(fit)),
         Section("without", "What trusting the instrument would claim", _without(fit), "Instrument"),
+        Section("setup", "What the set-up is known to", _setup(fit), "Set-up"),
         Section("readings", "Readings and fit", _readings(fit)),
         Section("pairs", "Material parameters together", _pairs(fit)),
         Section("prior", "What the prior said, and what the data", _prior(fit), "Prior and data"),
@@ -396,6 +403,35 @@ def discrepancy_table(fit: FitView, compared: pd.DataFrame, part: str, name: str
         TRUTH: lambda row: number(row["true_value"], scale(row)),
     }
     return fit_table(fit, "fit.without", cells, compared, name=name, part=part)
+
+
+def _setup(fit: FitView) -> Iterator[page.Block]:
+    """Where the uncertainty of the material comes from, as far as the set-up states it."""
+    if INPUT_SHIFTS not in fit.result.children or fit.method == "point":
+        return
+    yield budget_table(fit)
+    yield from budget_sentences(fit)
+
+
+def budget_table(fit: FitView) -> Table:
+    """Where the combined variance of each parameter of the material comes from."""
+    found, stated = budget(fit), fit.result[INPUT_SHIFTS].to_dataset()
+    data = variance_shares(found).T
+    descriptions = {"sd": "of the posterior", "combined": "with the set-up"}
+    descriptions |= {"noise": "of the readings", "prior": "of the parameters"}
+    for name, u in found.attrs["known"].items():
+        unit, meaning = (stated[key].sel(quantity=name).item() for key in ("unit", "meaning"))
+        descriptions[name] = f"{meaning}, ± {u:g}{'' if unit == '1' else f' {unit}'}"
+
+    def cell(label: str) -> Callable[[pd.Series], str]:
+        def of_row(row: pd.Series) -> str:
+            is_share = row.name not in ("sd", "combined")
+            return percent(row[label]) if is_share else number(row[label], row[label])
+
+        return of_row
+
+    cells = {label: cell(label) for label in data.columns}
+    return page.make_table("fit.budget", cells, data, label="source", descriptions=descriptions)
 
 
 # --- Readings and checks --------------------------------------------------------------------------

@@ -21,6 +21,7 @@ from polar_bayes import methods
 from polar_bayes.capture.plausibility import cautions, indices_by_eye
 from polar_bayes.capture.schema import count
 from polar_bayes.errors import FitError
+from polar_bayes.inference.input_sensitivity import mean_shifts
 from polar_bayes.inference.prior_probability import has_probabilities, probability_below
 from polar_bayes.inference.problem import Problem, make_problem
 from polar_bayes.inference.program import BLOCK, THREADS, Values, from_prior
@@ -69,6 +70,9 @@ def fit_request(
     timings.record("prediction")
     checked = method.cross_check(problem, posterior.parameters, key_check)
     timings.record("cross-check")
+    is_point = draws.covariance is not None
+    shifts = None if is_point else mean_shifts(request, problem, draws.z, posterior)
+    timings.record("budget")
 
     stated = {name: getattr(draws, name) for name in DIAGNOSTICS}
     known = {
@@ -88,7 +92,8 @@ def fit_request(
         provenance = {**known, "timings": seconds, **alternatives}
         provenance |= {"comparisons_failed": failed} if failed else {}
         ledger = request.scene.ledger  # how the scene was chosen
-        effects = {"effects": ledger} if isinstance(ledger, xr.Dataset) else {}
+        tables = {"effects": ledger} if isinstance(ledger, xr.Dataset) else {}
+        tables |= {} if shifts is None else {"input_shifts": shifts}
         return assemble(
             problem.program,
             request.capture,
@@ -96,11 +101,11 @@ def fit_request(
             posterior,
             prior,
             draws.stats,
-            {**comparisons, **effects},
+            {**comparisons, **tables},
             provenance,
         )
 
-    if not with_comparisons or draws.covariance is not None:  # a point has no interval to compare
+    if not with_comparisons or is_point:  # a point has no interval to compare
         return result({}, {}, {})
     removed, deadline = removed_terms(request), method.deadline(problem)
     if keep is not None:

@@ -47,7 +47,7 @@ def _commands(group: click.Group, path: str) -> Iterator[tuple[str, click.Comman
             yield from _commands(command, f"{path}{name} ")
 
 
-QUOTED = re.compile(r"--(?:method|prior|link) '[^']*'")
+QUOTED = re.compile(r"--(?:method|prior|link) '[^']*'|--known \S+")
 PYTHON = re.compile(r"polar_bayes\.[a-z_]+|\bpb\.|\b[a-z_]+='|\b[a-z_]+=[\d.]")
 
 VALUES = re.compile(
