@@ -11,11 +11,11 @@ ROOT = Path(__file__).parents[1]
 CODE = {
     "benchmark": 588,
     "calibration": 1075,
-    "capture": 783,
-    "cli": 1124,
+    "capture": 798,
+    "cli": 1129,
     "design": 1072,
     "diagnostics": 1689,
-    "importers": 1159,
+    "importers": 1289,
     "inference": 2798,
     "maps": 1734,
     "methods": 1252,
@@ -26,13 +26,13 @@ CODE = {
     "scenes": 1666,
     "own files": 1478,
     "models": 320,
-    "tests": 22785,
+    "tests": 22960,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 23484,
-    "classes": 335,
+    "code": 23634,
+    "classes": 336,
     "constants": 418,
     "Any": 172,
     "longest function": 80,
