@@ -11,11 +11,11 @@ ROOT = Path(__file__).parents[1]
 CODE = {
     "benchmark": 588,
     "calibration": 1075,
-    "capture": 891,
-    "cli": 1146,
+    "capture": 906,
+    "cli": 1151,
     "design": 1072,
     "diagnostics": 1769,
-    "importers": 1159,
+    "importers": 1289,
     "inference": 2883,
     "maps": 1734,
     "methods": 1252,
@@ -26,13 +26,13 @@ CODE = {
     "scenes": 1670,
     "own files": 1496,
     "models": 320,
-    "tests": 22927,
+    "tests": 23079,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 23822,
-    "classes": 344,
+    "code": 23972,
+    "classes": 345,
     "constants": 422,
     "Any": 172,
     "longest function": 80,

@@ -149,7 +149,7 @@ def cautions(capture: xr.Dataset) -> tuple[str, ...]:
     Returns:
         A sentence for each, none for a capture in which nothing is unlikely.
     """
-    found = [*_azimuth_cautions(capture), *_excess_cautions(capture)]
+    found = [*_azimuth_cautions(capture), *_excess_cautions(capture), *_gamma_cautions(capture)]
     for check in (_sign_cautions, _side_cautions, _scale_cautions):
         found += [each for name, part in _materials(capture) for each in check(name, part)]
     return tuple(dict.fromkeys(found))
@@ -288,6 +288,25 @@ def _excess_cautions(capture: xr.Dataset) -> Iterator[str]:
             f"5 stated errors (up to {largest:.3g}): "
             "no light has it, so errors are stated too small, or dark level, background or the "
             "gains of the channels are off."
+        )
+
+
+def _gamma_cautions(capture: xr.Dataset) -> Iterator[str]:
+    """Counts that four analyzer angles or more contradict to be in proportion to light."""
+    undone, gamma, error = (
+        float(capture.attrs.get(name, 1.0))
+        for name in ("transfer_gamma", "measured_gamma", "measured_gamma_error")
+    )
+    off = abs(np.log(gamma / undone))
+    # Tone curves compress: an exponent below 1 has another cause, such as an object that moved.
+    if "measured_gamma" in capture.attrs and gamma > 0.85 and off > max(0.05, 5.0 * error / gamma):
+        remedy = "'linear'" if gamma < 1.05 else f"{gamma:.2g}"
+        pictures = " (transfer='srgb' where they are pictures)" if 1.8 < gamma < 2.6 else ""
+        yield (
+            "Light behind the analyzers contradicts that counts are in proportion to it, as they "
+            f"are taken to be (transfer function: {capture.attrs.get('transfer', 'linear')}): the "
+            f"frames have a gamma of {gamma:.2f} +- {error:.2f}, and q and u are wrong by about "
+            f"{abs(undone / gamma - 1.0):.0%}; import them with transfer={remedy}{pictures}."
         )
 
 

@@ -210,6 +210,10 @@ image_options = all_of(
     option("--dark-level", type=float, help="Count without light, in place of --dark."),
     option("--flat", type=INPUT, help="Frame of even light."),
     option("--saturation-level", type=float, help="Count of a full pixel."),
+    option(
+        "--transfer", metavar="srgb|linear|GAMMA",
+        help="Tone curve of all frames, to be undone; linear: none, whatever a file states.",
+    ),
     option("--gain", type=float, help="Counts per electron."),
     option("--read-noise", type=float, default=1.0, help="In counts."),
     option("--relative-error", type=float, default=0.01),

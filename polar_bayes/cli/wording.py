@@ -37,7 +37,7 @@ FUNCTIONS = {
 KEYWORDS = {
     **{name: f"--{name}" for name in ("angle", "dim", "drop", "keep", "method", "model", "p")},
     **{name: f"--{name}" for name in ("precision", "preset", "s", "scene", "scheduler", "seed")},
-    **{name: f"--{name}" for name in ("setup", "table", "truth")},
+    **{name: f"--{name}" for name in ("setup", "table", "transfer", "truth")},
     "links": "--link",
     "parameter": "--profile",
     "priors": "--prior",
@@ -81,6 +81,7 @@ RULES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     # Other keywords, and functions.
     (r"shared=\(\)", "--share none"),
     (r"truth=capture", "--truth"),
+    (r"\btransfer=(GAMMA|\d+\.?\d*)", r"--transfer \1"),
     (rf"\b({KEYWORD})='([^']*)'(?: or '([^']*)')?", lambda found: _option(*found.groups())),
     (rf"{FREE}({KEYWORD})=(?=[\s,;)]|\.\s|\.?$)", lambda found: KEYWORDS[found[1]]),
     (rf"give the tree (that|as) (?={PACKAGE})", r"give the file \1 "),

@@ -10,14 +10,18 @@ with read noise $\sigma_r$ (counts), rounding to whole counts, photon noise of g
 electron), and N pixels averaged. Averaging does not reduce $\epsilon$: unequal transmission
 of the analyzers, light that flickers, a flat field that has changed.
 
-PNG and TIFF files go through Pillow, which every plotting library brings along; .npy files hold
-what a script saved. A frame in color is refused: its channels would have to be separated first.
+PNG, TIFF and JPEG files go through Pillow, which every plotting library brings along; .npy files
+hold what a script saved. A frame in color is refused: its channels would have to be separated
+first. A frame that states a tone curve is refused unless `Detector.transfer` says what to do about
+it. Where a curve is undone (`polar_bayes.importers.transfer`), R, D, F and the saturation level are
+linear counts, with the white of the file, and rounding is that of one count of the file:
+$w^2/12$ where such a count is w linear counts wide.
 """
 
 import dataclasses
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from numbers import Real
 
 import numpy as np
@@ -25,6 +29,7 @@ from PIL import Image
 
 from polar_bayes.capture.schema import Interval
 from polar_bayes.errors import CaptureError
+from polar_bayes.importers.transfer import as_transfer, stated_curve
 from polar_bayes.paths import existing_file
 
 # --- Reading frames -------------------------------------------------------------------------------
@@ -32,10 +37,23 @@ from polar_bayes.paths import existing_file
 Frame = str | os.PathLike[str] | np.ndarray
 
 
-def read_frame(frame: object, where: str) -> tuple[np.ndarray, float | None]:
-    """One frame of gray values, and the count of a full pixel where the format states it."""
-    values = read_image(frame, where)
+def read_frame(
+    frame: object, where: str, transfer: str | float | None = None
+) -> tuple[np.ndarray, float | None]:
+    """One frame of gray values, and the count of a full pixel where the format states it.
+
+    Raises:
+        CaptureError: It is no frame, or it states a tone curve and no transfer function is given.
+    """
+    values, curve = read_image(frame, where, ("PNG", "TIFF", "JPEG"))
     where = str(frame) if isinstance(frame, str | os.PathLike) else where
+    if curve and transfer is None:
+        what = f"it states a tone curve ({curve}), so its counts are not in proportion to light"
+        hint = (
+            "undo it by transfer='srgb' or transfer=GAMMA, or state by transfer='linear' that the "
+            "counts are linear nevertheless"
+        )
+        raise CaptureError(what, where=where, hint=hint)
     if values.dtype.kind not in "uif" or values.ndim != 2 or values.size == 0:
         what = f"it holds {values.dtype.name} of shape {values.shape}, not one frame of gray values"
         hint = "give rows and columns of numbers; of a color frame, one channel"
@@ -69,20 +87,23 @@ def read_array(path: str | os.PathLike[str], where: str) -> np.ndarray:
     return np.array(mapped)
 
 
-def read_image(frame: object, where: str) -> np.ndarray:
-    """The values of one channel of an image file, or of an array as it is."""
+def read_image(
+    frame: object, where: str, formats: tuple[str, ...] = ("PNG", "TIFF")
+) -> tuple[np.ndarray, str]:
+    """The values of one channel of an image file, or of an array, and the tone curve it states."""
     if not isinstance(frame, str | os.PathLike):
-        return np.asarray(frame)
+        return np.asarray(frame), ""
     file, gray = existing_file(frame, where), ("L", "I;16", "I;16L", "I;16B", "I", "F")
     if file.suffix == ".npy":
-        return read_array(file, where)
+        return read_array(file, where), ""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            # These formats keep counts as they are.
-            with Image.open(file, formats=("PNG", "TIFF")) as image:
+            with Image.open(file, formats=formats) as image:
                 mode, pages = image.mode, getattr(image, "n_frames", 1)
-                values = np.asarray(image) if mode in gray and pages == 1 else None
+                is_frame = mode in gray and pages == 1
+                curve = stated_curve(image) if is_frame else ""
+                values = np.asarray(image) if is_frame else None
     except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
         hint = "cut it to what matters, or give it as .npy"
         raise CaptureError("it is larger than any camera", where=str(file), hint=hint) from error
@@ -90,7 +111,7 @@ def read_image(frame: object, where: str) -> np.ndarray:
         hint = "give PNG, TIFF or .npy"
         raise CaptureError("it cannot be read as an image", where=str(file), hint=hint) from error
     if values is not None:
-        return values
+        return values, curve
     if mode not in gray:
         hint = "save it with 8 or 16 bits of gray, or give one channel as .npy"
         raise CaptureError(f"its pixels are {mode}, not gray values", where=str(file), hint=hint)
@@ -116,9 +137,15 @@ class Detector:
         read_noise: Standard deviation of a pixel without light, in counts, >= 0.
         relative_error: What stays unknown of every reading however many pixels are averaged, over
             the reading, in [0, 1).
+        transfer: Opto-electronic transfer function of all frames, which is undone first: "srgb",
+            a gamma from 0.2 to 5 (light is the count to that power), or "linear": counts are in
+            proportion to light, whatever files state. By default they are, and files that state
+            a tone curve are refused. Saturation level, dark and flat are given in the counts of
+            the files, gain and read noise in linear counts with the same white: 255 for 8 bits,
+            else the saturation level.
 
     Raises:
-        CaptureError: A number is outside its range.
+        CaptureError: A number is outside its range, or there is no such transfer function.
     """
 
     saturation_level: float | None = None
@@ -127,6 +154,7 @@ class Detector:
     gain: float | None = None
     read_noise: float = 1.0
     relative_error: float = 0.01
+    transfer: str | float | None = None
 
     def __post_init__(self) -> None:
         for name in ("saturation_level", "gain"):
@@ -134,6 +162,7 @@ class Detector:
                 Interval(0.0, 1e9, open_low=True).check(getattr(self, name), name)
         Interval(0.0, 1e9).check(self.read_noise, "read_noise")
         Interval(0.0, 1.0, open_high=True).check(self.relative_error, "relative_error")
+        as_transfer(self.transfer)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -154,27 +183,37 @@ def signal_of(frames: Sequence[np.ndarray], level: float | None, detector: Detec
         what = "the frames do not say at which count a pixel is full"
         hint = "give it: 4095 for 12 bits, 65535 for 16 bits"
         raise CaptureError(what, where="saturation_level", hint=hint)
+    transfer = as_transfer(detector.transfer)
+    white = full if level is None else level
+
+    def linear(counts: np.ndarray) -> np.ndarray:
+        return transfer.linear(counts, white)
+
     raw = np.stack(frames)
     shape, dark = raw.shape[1:], detector.dark
     if isinstance(dark, Real):
         dark = np.full(shape, Interval(-1e9, 1e9).check(dark, "dark"))
     else:
-        dark = _calibration_frame(dark, shape, "dark")
-    flat = _flat(detector.flat, shape)
+        dark = _calibration_frame(dark, shape, "dark", detector)
     if not (dark < full).all():
         hint = "check it and the saturation level"
         raise CaptureError(f"it reaches the full count {full:g}", where="dark", hint=hint)
+    flat = _flat(detector, shape, linear)
+    rounding = linear(raw + 0.5) - linear(raw - 0.5)
+    raw, dark, full = linear(raw), linear(dark), float(linear(np.array(float(full))))
     # Electrons that fill a pixel of a machine-vision sensor.
     gain = full / 10_000.0 if detector.gain is None else float(detector.gain)
     counts = raw - dark
-    variance = detector.read_noise**2 + 1.0 / 12.0 + gain * np.maximum(counts, 0.0)
+    variance = detector.read_noise**2 + rounding**2 / 12.0 + gain * np.maximum(counts, 0.0)
     return Signal(
         light=counts / flat,
         variance=variance / flat**2,
         saturated=raw >= full,
         full_scale=float(np.max((full - dark) / flat)),
         metadata={
-            "saturation_level": float(full),
+            "transfer": transfer.description,
+            "transfer_gamma": transfer.gamma,
+            "saturation_level": full,
             "dark": _source(detector.dark),
             "flat": _source(detector.flat),
             "gain": gain,
@@ -185,11 +224,13 @@ def signal_of(frames: Sequence[np.ndarray], level: float | None, detector: Detec
     )
 
 
-def _flat(flat: Frame | None, shape: tuple[int, ...]) -> np.ndarray:
+def _flat(
+    detector: Detector, shape: tuple[int, ...], linear: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
     """Relative sensitivity of each pixel, of mean 1."""
-    if flat is None:
+    if detector.flat is None:
         return np.ones(shape)
-    values = _calibration_frame(flat, shape, "flat")
+    values = linear(_calibration_frame(detector.flat, shape, "flat", detector))
     mean = float(values.mean())
     if not mean > 0.0 or not (values > 0.05 * mean).all():
         row, column = np.unravel_index(np.argmin(values), shape)
@@ -199,8 +240,10 @@ def _flat(flat: Frame | None, shape: tuple[int, ...]) -> np.ndarray:
     return values / mean
 
 
-def _calibration_frame(frame: object, shape: tuple[int, ...], where: str) -> np.ndarray:
-    values, _ = read_frame(frame, where)
+def _calibration_frame(
+    frame: object, shape: tuple[int, ...], where: str, detector: Detector
+) -> np.ndarray:
+    values, _ = read_frame(frame, where, detector.transfer)
     if values.shape != shape:
         what = f"it is {values.shape}, the frames are {shape}"
         hint = "take it with the same camera at the same size"

@@ -48,6 +48,7 @@ from polar_bayes.importers.camera_geometry import (
     mirror_direction,
 )
 from polar_bayes.importers.detector import Detector, Frame, Signal, os_name, read_frame, signal_of
+from polar_bayes.importers.linearity import restoring_exponent
 from polar_bayes.importers.normals import AbstractShape, ShapeLike, as_shape
 from polar_bayes.importers.stokes import StokesImage, check_angles, fit_stokes, unbiased_dop
 
@@ -200,6 +201,7 @@ def _capture(
         "valid": valid,
     }
     misfit = stokes.misfit
+    bright = stokes.intensity > 10.0 * np.sqrt(stokes.intensity_variance)
     described = attributes | {
         "setup": "picture",
         "analyzer_angles": ", ".join(f"{angle:g}" for angle in angles),
@@ -212,6 +214,7 @@ def _capture(
         "largest_correlation_of_q_and_u": float(np.abs(stokes.correlation[valid]).max()),
         **({} if misfit is None else {"median_misfit": float(np.median(misfit[valid]))}),
         "dop_at_one": int((valid & (dop > 1.0)).sum()),
+        **_measured_gamma(light, variance, angles, bright & ~saturated, signal),
     }
     rows, columns = binning.centers(binning.width)
     capture = xr.Dataset(
@@ -224,6 +227,19 @@ def _capture(
     if wavelength is not None:
         capture = capture.assign_coords(wavelength=POSITIVE.check(wavelength, "wavelength"))
     return validate(capture, source=attributes["name"])
+
+
+def _measured_gamma(
+    light: np.ndarray, variance: np.ndarray, angles: np.ndarray, used: np.ndarray, signal: Signal
+) -> dict[str, float]:
+    """The gamma of the files that the redundancy of the angles means, as attributes."""
+    # Noise is to be small, and the shape of the light is to stay.
+    coarse, metadata = Binning(used.shape, max(1, min(used.shape) // 32), 1), signal.metadata
+    noise, used = coarse.mean(variance) / coarse.bin**2, ~coarse.any(~used)
+    error, undone = float(metadata["relative_error"]), float(metadata["transfer_gamma"])
+    found = restoring_exponent(coarse.mean(light), noise, error, angles, used)
+    names = "measured_gamma", "measured_gamma_error"
+    return {name: undone * value for name, value in zip(names, found or (), strict=False)}
 
 
 def _reasons_to_mask(
@@ -280,8 +296,8 @@ def from_polarizer(
     frame count from zero at its upper left pixel.
 
     Args:
-        frames: One for each angle: PNG, TIFF or .npy files, or arrays of shape (row, column), in
-            counts that grow in proportion to light.
+        frames: One for each angle: PNG, TIFF, JPEG or .npy files, or arrays of shape (row, column),
+            in counts that grow in proportion to light, or with a `Detector.transfer`.
         angles: Of the polarizer's axis (that of the light that passes), from x counterclockwise as
             the camera sees it, degree. Three different ones or more, shape (frame,).
         shape: Where the surface points: a `Sphere`, several, or unit normals of shape
@@ -303,7 +319,7 @@ def from_polarizer(
     Raises:
         CaptureError: A frame, an angle, a place or an option is wrong, or no reading is left.
     """
-    degrees = check_angles(angles)
+    degrees, detector = check_angles(angles), detector or Detector()
     if isinstance(frames, str) or not hasattr(frames, "__len__"):
         hint = "give a list of frames, one for each angle"
         raise CaptureError(f"a {type(frames).__name__} is no list", where="frames", hint=hint)
@@ -311,7 +327,8 @@ def from_polarizer(
         what = f"there are {len(frames)} frames and {len(degrees)} angles"
         raise CaptureError(what, where="frames", hint="give one frame for each angle")
     raw, levels = zip(
-        *(read_frame(frame, f"frames[{k}]") for k, frame in enumerate(frames)), strict=True
+        *(read_frame(each, f"frames[{k}]", detector.transfer) for k, each in enumerate(frames)),
+        strict=True,
     )
     for k, values in enumerate(raw):
         if values.shape != raw[0].shape:
@@ -320,7 +337,7 @@ def from_polarizer(
             raise CaptureError(what, where=f"frames[{k}]", hint=hint)
     binning = Binning(raw[0].shape, bin, window)
     geometry, placement = _locate(shape, view, light, binning)
-    signal = signal_of(raw, None if None in levels else levels[0], detector or Detector())
+    signal = signal_of(raw, None if None in levels else levels[0], detector)
     return _capture(
         binning.mean(signal.light),
         binning.mean(signal.variance) / binning.bin**2,
@@ -360,8 +377,8 @@ def from_mosaic(
     """A capture from one frame of a polarization camera without color.
 
     Args:
-        frame: A PNG, TIFF or .npy file, or an array of shape (row, column): raw counts, with an
-            even number of rows and columns.
+        frame: A PNG, TIFF, JPEG or .npy file, or an array of shape (row, column): raw counts, with
+            an even number of rows and columns.
         shape: See `polar_bayes.from_polarizer`; the arguments that are not explained here too.
         light: Location of the light.
         view: Location of the camera.
@@ -381,8 +398,8 @@ def from_mosaic(
             reading is left.
     """
     polanalyser = _polanalyser()
-    angles = _angles(layout)
-    counts, level = read_frame(frame, "frame")
+    angles, detector = _angles(layout), detector or Detector()
+    counts, level = read_frame(frame, "frame", detector.transfer)
     if counts.shape[0] % 2 or counts.shape[1] % 2:
         hint = "give the frame as the sensor has it, from its first row and column"
         raise CaptureError(f"it is {counts.shape}, not even", where="frame", hint=hint)
@@ -391,7 +408,7 @@ def from_mosaic(
         hint = "give an even number: each square holds all four polarizers"
         raise CaptureError(f"it is {bin}", where="bin", hint=hint)
     geometry, placement = _locate(shape, view, light, binning)
-    signal = signal_of([counts], level, detector or Detector())
+    signal = signal_of([counts], level, detector)
     version = f"polanalyser {importlib.metadata.version('polanalyser')}, bilinear"
     return _capture(
         binning.mean(_demosaiced(polanalyser, signal.light[0])),

@@ -63,7 +63,7 @@ class StokesImage:
 
 def fit_stokes(light: np.ndarray, variance: np.ndarray, angles: object) -> StokesImage:
     """Stokes parameters by least squares."""
-    design = _design(check_angles(angles))
+    design = polarizer_design(check_angles(angles))
     solve = np.linalg.pinv(design)
     S = np.einsum("sa,ayx->syx", solve, light)
     C = np.einsum("sa,ta,ayx->styx", solve, solve, variance)
@@ -111,7 +111,7 @@ def check_angles(angles: object) -> np.ndarray:
     if different.size < 3:
         what = f"the polarizer stood at {different.size} different angles ({listed})"
         raise CaptureError(what, where="angles", hint="give three or more; 0 and 180 are the same")
-    condition = float(np.linalg.cond(_design(degrees)))
+    condition = float(np.linalg.cond(polarizer_design(degrees)))
     if condition > 100.0:
         what = f"{listed} are so close that noise grows {condition:.0f}-fold"
         hint = "spread them over 180 degrees, such as 0, 60 and 120"
@@ -119,7 +119,7 @@ def check_angles(angles: object) -> np.ndarray:
     return degrees
 
 
-def _design(degrees: np.ndarray) -> np.ndarray:
+def polarizer_design(degrees: np.ndarray) -> np.ndarray:
     """Sensitivity of each angle to S0, S1 and S2: (angle, 3)."""
     twice = np.deg2rad(2.0 * degrees)
     return 0.5 * np.stack([np.ones_like(twice), np.cos(twice), np.sin(twice)], axis=-1)

@@ -159,7 +159,7 @@ def load_labels(path: str | os.PathLike[str]) -> np.ndarray:
     Raises:
         CaptureError: It cannot be read, has colors, or does not hold labels.
     """
-    values = read_image(path, "labels")
+    values, _ = read_image(path, "labels")
     if values.ndim != len(IMAGE) or values.dtype.kind not in "biu":
         what = f"it has values of shape {values.shape} and type {values.dtype}"
         hint = "save it with one channel of whole numbers: one gray value for each region"

@@ -7,6 +7,7 @@ import pictures
 import pytest
 from cases import each
 from pictures import BALL, LAMP
+from PIL import Image
 
 import polar_bayes as pb
 from polar_bayes.cli import main
@@ -38,11 +39,16 @@ def test_frames_behind_a_polarizer(
     out = tmp_path / "ball.nc"
     noise = ["--gain", "0.2", "--read-noise", "2", "--relative-error", "0", "--dark-level", "1"]
     words = [*files, *SPHERE, *LIGHT, *FULL, *noise, "--bin", "2", "--window", "1"]
-    words += ["--wavelength", "550", "--name", "ball"]
+    words += ["--wavelength", "550", "--name", "ball", "--transfer", "1.8"]
     assert main(["import", "polarizer", *words, "--out", str(out)]) == 0
     said = capsys.readouterr().out
     detector = pb.importers.Detector(
-        saturation_level=1000.0, dark=1.0, gain=0.2, read_noise=2.0, relative_error=0.0
+        saturation_level=1000.0,
+        dark=1.0,
+        gain=0.2,
+        read_noise=2.0,
+        relative_error=0.0,
+        transfer=1.8,
     )
     known = {"shape": BALL, "light": LAMP, "detector": detector, "bin": 2, "window": 1}
     wanted = pb.from_polarizer(raw, ANGLES, wavelength=550.0, name="ball", **known)
@@ -107,12 +113,21 @@ def rim() -> np.ndarray:
         ([*SPHERE, *LIGHT], "saturation_level: the frames do not say"),
         ([*SPHERE, *LIGHT, *FULL, "--dark", "none.npy"], "none.npy: there is no such file"),
         ([*SPHERE, "--highlight", "0", "0", *FULL], "there is no surface"),
+        ([*SPHERE, *LIGHT, *FULL, "--transfer", "rec709"], "transfer: it is 'rec709'"),
+        ([*SPHERE, *LIGHT, *FULL, "--dark", "curved.png"], "undo it by --transfer srgb or"),
     ],
 )
 def test_a_mistake_takes_one_line_and_writes_nothing(
-    files: list[str], words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture
+    files: list[str],
+    words: list[str],
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     out = tmp_path / "ball.nc"
+    monkeypatch.chdir(tmp_path)
+    Image.new("L", (48, 40)).save("curved.png", icc_profile=b"a tone curve")
     assert main(["import", "polarizer", *files, *words, "--out", str(out)]) == 1
     error = capsys.readouterr().err
     assert said in error

@@ -62,6 +62,7 @@ REFUSED = {
     "s": lambda: pb.from_goniometer((np.ones(3), np.ones(2)), (np.ones(3),) * 2),
     "angles": lambda: pb.from_polarizer(pictures.frames(FOUR), (0.0, 0.0, 0.0), **CAMERA),
     "frame": lambda: pb.from_mosaic(np.zeros((4, 4, 4)), **CAMERA),
+    "transfer": lambda: pb.importers.Detector(transfer="rec709"),
     "no_such_table": lambda: pb.from_table("no_such_table.csv"),
 }
 
