@@ -16,7 +16,7 @@ CODE = {
     "design": 1072,
     "diagnostics": 1769,
     "importers": 1289,
-    "inference": 2883,
+    "inference": 2886,
     "maps": 1734,
     "methods": 1252,
     "numerics": 884,
@@ -26,12 +26,12 @@ CODE = {
     "scenes": 1670,
     "own files": 1496,
     "models": 320,
-    "tests": 23079,
+    "tests": 23082,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 23972,
+    "code": 23975,
     "classes": 345,
     "constants": 422,
     "Any": 172,

@@ -173,8 +173,8 @@ class ToneCurve(AbstractInputQuantity):
         power = 1.0 / (1.0 + amount)
 
         def straight(reading: xr.DataArray) -> xr.DataArray:
-            with np.errstate(divide="ignore"):  # a reading of 1 stays one
-                return reading.copy(data=np.tanh(power * np.arctanh(reading.to_numpy())))
+            inside = abs(reading) < 1.0  # noise beyond full polarization stays as it is
+            return reading.where(~inside, np.tanh(power * np.arctanh(reading.where(inside, 0.0))))
 
         new = {name: straight(capture[name]) for name in POLARIZATION if name in capture}
         if "intensity" in capture:

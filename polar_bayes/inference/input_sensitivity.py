@@ -102,6 +102,8 @@ def _covariances(
     parts: int = 10,
 ) -> Float[np.ndarray, "2 quantity value"]:
     """Covariances of values with rates over the draws, and their standard errors."""
+    known = np.isfinite(rates).any(axis=0)
+    rates = np.where(known, rates, 0.0)
     finite = np.isfinite(np.hstack([gradient, rates, values])).all(axis=1)
     draws = tuple(each[finite] for each in (z, gradient, rates, values))
     groups = np.arange(len(draws[0])) * parts // max(len(draws[0]), 1)
@@ -109,7 +111,8 @@ def _covariances(
     without = np.stack([_estimates(*(x[groups != g] for x in draws)) for g in range(parts)])
     errors = np.sqrt((parts - 1.0) * without.var(axis=0))
     best = np.argmin(errors, axis=0)[None]
-    return np.concatenate([np.take_along_axis(x, best, 0) for x in (estimates, errors)])
+    found = np.concatenate([np.take_along_axis(x, best, 0) for x in (estimates, errors)])
+    return np.where(known[:, None], found, np.nan)
 
 
 def _estimates(

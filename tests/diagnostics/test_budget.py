@@ -164,6 +164,11 @@ def test_a_shifted_capture_is_that_of_a_perfect_instrument(quantity, record) -> 
     xr.testing.assert_allclose(quantity.shifted(PERFECT, 0.0), PERFECT, rtol=1e-14)
 
 
+def test_noise_beyond_full_polarization_stays() -> None:
+    noisy = PERFECT.assign(q=("view", [1.02, -1.0, np.nan]))
+    xr.testing.assert_identical(ToneCurve(1.0).shifted(noisy, 0.1)["q"], noisy["q"])
+
+
 def test_every_quantity_is_in_a_set_up_and_in_this_test() -> None:
     stated = {type(known) for own in SETUPS.values() for known in own.known}
     assert stated == set(map(type, RECORDED))
