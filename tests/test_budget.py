@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 CODE = {
     "benchmark": 588,
     "calibration": 1075,
-    "capture": 906,
+    "capture": 909,
     "cli": 1151,
     "design": 1072,
     "diagnostics": 1769,
@@ -26,12 +26,12 @@ CODE = {
     "scenes": 1670,
     "own files": 1496,
     "models": 320,
-    "tests": 23082,
+    "tests": 23089,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 23975,
+    "code": 23978,
     "classes": 345,
     "constants": 422,
     "Any": 172,

@@ -10,7 +10,8 @@ uncertainty.
 
 import abc
 import dataclasses
-from typing import ClassVar, override
+from numbers import Real
+from typing import ClassVar, Self, override
 
 import numpy as np
 import xarray as xr
@@ -36,9 +37,14 @@ class AbstractInputQuantity(abc.ABC):
 
     def __post_init__(self) -> None:
         u = self.standard_uncertainty
-        if not (np.isscalar(u) and np.isfinite(u) and u > 0.0):
+        if not (isinstance(u, Real) and np.isfinite(u) and u > 0.0):
             where = f"{type(self).__name__}: standard_uncertainty"
             raise FitError(f"it is {u!r}", where=where, hint=f"give a number above 0 ({self.unit})")
+
+    def as_stated(self, capture: xr.Dataset) -> Self:
+        """The same with the standard uncertainty that a capture states, as `<name>_uncertainty`."""
+        u = capture.attrs.get(f"{self.name}_uncertainty", self.standard_uncertainty)
+        return dataclasses.replace(self, standard_uncertainty=u)
 
     def acts_on(self, capture: xr.Dataset) -> bool:
         """Whether readings of a capture may depend on it."""

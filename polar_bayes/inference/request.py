@@ -187,7 +187,7 @@ def resolve(
         seed=int(seed),
         precision=precision,
         shared=tuple(name for name in setup.shared if name in found.priors),
-        known=tuple(each for each in setup.known if each.acts_on(capture)),
+        known=tuple(each.as_stated(capture) for each in setup.known if each.acts_on(capture)),
     )
 
 

@@ -83,6 +83,15 @@ def test_it_is_kept_in_a_file_and_the_verdict_notes_it(fit: xr.DataTree, tmp_pat
     assert "comes from the gain of polarization, known to 0.01; known to 0.005, it" in sentence
 
 
+def test_a_capture_states_what_its_set_up_is_known_to(capture: xr.Dataset) -> None:
+    better = capture.assign_attrs(sample_lean_uncertainty=0.05)
+    found = pb.budget(pb.fit(better, scene=setup(*KNOWN), **ASKED)).attrs["known"]
+    assert found == {each.name: each.standard_uncertainty for each in KNOWN} | {"sample_lean": 0.05}
+    wrong = capture.assign_attrs(sample_lean_uncertainty="by eye")
+    with pytest.raises(pb.FitError, match="SampleLean: standard_uncertainty: it is 'by eye'; give"):
+        pb.fit(wrong, scene=setup(*KNOWN), **ASKED)
+
+
 @each(
     "known, message",
     [
