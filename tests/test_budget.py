@@ -14,7 +14,7 @@ CODE = {
     "capture": 909,
     "cli": 1151,
     "design": 1072,
-    "diagnostics": 1769,
+    "diagnostics": 1783,
     "importers": 1289,
     "inference": 2886,
     "maps": 1734,
@@ -22,17 +22,17 @@ CODE = {
     "numerics": 884,
     "observation": 491,
     "physics": 2384,
-    "reporting": 3008,
+    "reporting": 3028,
     "scenes": 1670,
     "own files": 1496,
     "models": 320,
-    "tests": 23089,
+    "tests": 23109,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 23978,
-    "classes": 345,
+    "code": 24012,
+    "classes": 346,
     "constants": 422,
     "Any": 172,
     "longest function": 80,

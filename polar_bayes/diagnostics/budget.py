@@ -11,6 +11,7 @@ Kallioinen et al. (2024), Statistics and Computing 34, 57 (power scaling).
 """
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -123,25 +124,49 @@ def _own_parts(fit: FitView, scalar: Scalar, sd: float) -> tuple[float, float]:
     return sd * np.sqrt(noise), sd * np.sqrt(1.0 - noise)
 
 
+class BetterKnown(NamedTuple):
+    """The quantity that contributes most to a parameter, and what knowing it twice as well does."""
+
+    meaning: str
+    known: str
+    half: str
+    combined: float
+
+
+def better_known(fit: FitView, label: str) -> BetterKnown:
+    """What to know better for the sake of a parameter."""
+    table, group = budget(fit), fit.result[INPUT_SHIFTS].to_dataset()
+    known = table.attrs["known"]
+    name = str(table.loc[label, list(known)].abs().idxmax())
+    half = 0.5 * known[name]
+    unit, meaning = (group[key].sel(quantity=name).item() for key in ("unit", "meaning"))
+    of_unit = "" if unit == "1" else f" {unit}"
+    combined = float(budget(fit, known={name: half}).loc[label, "combined"])
+    return BetterKnown(meaning, f"{known[name]:g}{of_unit}", f"{half:g}{of_unit}", combined)
+
+
+@once
+def wider_by_setup(fit: FitView) -> pd.Series:
+    """Factors by which the set-up widens uncertainties, the largest first; those worth a word."""
+    if INPUT_SHIFTS not in fit.result.children or fit.method == "point":
+        return pd.Series(dtype=float)
+    table = budget(fit)
+    ratio = (table["combined"] / table["sd"]).where(table["sd"] > 0.0)
+    return ratio[ratio > LIMITS.of_setup].sort_values(ascending=False)
+
+
 @once
 def budget_sentences(fit: FitView) -> tuple[str, ...]:
     """What the intervals leave out, where that is material; what to know better first."""
-    if INPUT_SHIFTS not in fit.result.children or fit.method == "point":
-        return ()
-    table, group = budget(fit), fit.result[INPUT_SHIFTS].to_dataset()
-    ratio = (table["combined"] / table["sd"]).where(table["sd"] > 0.0)
-    wider = ratio[ratio > LIMITS.of_setup].sort_values(ascending=False)
+    wider = wider_by_setup(fit)
     if wider.empty:
         return ()
-    worst, known = str(wider.index[0]), table.attrs["known"]
-    first = str(table.loc[worst, list(known)].abs().idxmax())
-    better = budget(fit, known={first: 0.5 * known[first]}).loc[worst, "combined"]
-    quantity, now = group.sel(quantity=first), table.loc[worst, "combined"]
-    unit = "" if quantity["unit"].item() == "1" else f" {quantity['unit'].item()}"
+    worst = str(wider.index[0])
+    better, now = better_known(fit, worst), budget(fit).loc[worst, "combined"]
     factors = join([f"{label} {factor:.2g} times" for label, factor in wider.items()])
     return (
         "The intervals assume a set-up that is known perfectly. As well as it is known, standard "
         f"uncertainties are larger: {factors}. Most of that of {worst} comes from the "
-        f"{quantity['meaning'].item()}, known to {known[first]:g}{unit}; known to "
-        f"{0.5 * known[first]:g}{unit}, it would leave {better:.2g} instead of {now:.2g}.",
+        f"{better.meaning}, known to {better.known}; known to {better.half}, it would leave "
+        f"{better.combined:.2g} instead of {now:.2g}.",
     )

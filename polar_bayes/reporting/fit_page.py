@@ -95,6 +95,7 @@ def fit_page(result: xr.DataTree | FitView) -> page.Page:
     sentences: list[str] = []
     if judged.passed:
         sentences = [*text.index_sentences(fit), text.trust(fit), text.next_sentence(fit.result)]
+        sentences += text.setup_beside_views(fit)
         sentences += [*text.determined(fit), *text.between_members(fit)]
     approximation = "Convergence" if fit.method == "nuts" else "Approximation"
     code = str(fit.provenance.get("model_source") or "")

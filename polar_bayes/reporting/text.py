@@ -16,6 +16,7 @@ from polar_bayes.benchmark.advice import Study, accuracy_view
 from polar_bayes.calibration.scores import is_calibrated, p_values, significance_level
 from polar_bayes.calibration.verdict import CalibrationView, calibration_verdict
 from polar_bayes.diagnostics import convergence
+from polar_bayes.diagnostics.budget import better_known, budget, wider_by_setup
 from polar_bayes.diagnostics.compare import FitComparison
 from polar_bayes.diagnostics.convergence import Verdict
 from polar_bayes.diagnostics.criticism import criticize
@@ -331,6 +332,28 @@ def next_sentence(result: xr.DataTree) -> str:
     least, most = (f"{end(1.0 - after / before):.0%}" for end in (np.min, np.max))
     by = least if least == most else f"{least} to {most}"
     return f"{views}: the 95% intervals{of} are expected to narrow by {by}."
+
+
+def setup_beside_views(fit: FitView) -> list[str]:
+    """What further views do for n, and what knowing the set-up better does, where it matters."""
+    wider = wider_by_setup(fit).filter(like="refractive_index")
+    if "next_views" not in fit.result.children or wider.empty:
+        return []
+    label = str(wider.index[0])
+    table, better = budget(fit), better_known(fit, label)
+    width = fit.result["next_views"]["interval_width"].transpose("step", "parameter").to_pandas()
+    if label not in width:
+        return []
+    sd, combined = table.loc[label, ["sd", "combined"]]
+    now, views, setup = (
+        math.hypot(width[label].iloc[step], 2.0 * 1.96 * math.sqrt(whole**2 - sd**2))
+        for step, whole in ((0, combined), (-1, combined), (0, better.combined))
+    )
+    return [
+        f"With what the set-up is known to, these views narrow the 95% interval of {label} by "
+        f"{1.0 - views / now:.0%}; the {better.meaning} known to {better.half} instead of "
+        f"{better.known} narrows it by {1.0 - setup / now:.0%}."
+    ]
 
 
 def trust(fit: FitView) -> str:

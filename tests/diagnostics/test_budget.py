@@ -20,6 +20,8 @@ from polar_bayes.capture.input_quantities import (
     ViewZenithScale,
 )
 from polar_bayes.diagnostics.budget import budget_sentences, variance_shares
+from polar_bayes.diagnostics.view import view_of
+from polar_bayes.reporting.text import setup_beside_views
 from polar_bayes.setups import SETUPS, Setup
 
 KNOWN = (SampleLean(0.2), ViewZenithScale(0.002), PolarizationGain(0.01), ToneCurve(0.01))
@@ -90,6 +92,28 @@ def test_a_capture_states_what_its_set_up_is_known_to(capture: xr.Dataset) -> No
     wrong = capture.assign_attrs(sample_lean_uncertainty="by eye")
     with pytest.raises(pb.FitError, match="SampleLean: standard_uncertainty: it is 'by eye'; give"):
         pb.fit(wrong, scene=setup(*KNOWN), **ASKED)
+
+
+def test_views_are_weighed_against_the_set_up(fit: xr.DataTree) -> None:
+    told, table = fit.copy(), pb.budget(fit)
+    sd, combined = table.loc["refractive_index", ["sd", "combined"]]
+    told["next_views"] = xr.Dataset(
+        {
+            "interval_width": (("step", "parameter"), [[3.92 * sd], [0.0]]),
+            **{name: ("pick", [70.0]) for name in ("view_zenith", "light_zenith")},
+            **{name: ("pick", [180.0]) for name in ("view_azimuth", "light_azimuth")},
+        },
+        coords={"parameter": ["refractive_index"]},
+    )
+    by_views = 1.0 - np.sqrt(1.0 - (sd / combined) ** 2)
+    half = pb.budget(fit, known={"polarization_gain": 0.005}).loc["refractive_index", "combined"]
+    (sentence,) = setup_beside_views(view_of(told))
+    assert sentence == (
+        "With what the set-up is known to, these views narrow the 95% interval of "
+        f"refractive_index by {by_views:.0%}; the gain of polarization known to 0.005 instead of "
+        f"0.01 narrows it by {1.0 - half / combined:.0%}."
+    )
+    assert setup_beside_views(view_of(fit)) == []
 
 
 @each(
