@@ -152,8 +152,8 @@ class AmbientLight(AbstractInputQuantity):
     """Unpolarized light was subtracted in excess: that share of the brightest reading."""
 
     name = "ambient_light"
-    unit = "1"
-    meaning = "ambient light, of the brightest reading"
+    unit = "of the brightest reading"
+    meaning = "ambient light"
 
     @override
     def shifted(self, capture: xr.Dataset, amount: float) -> xr.Dataset:

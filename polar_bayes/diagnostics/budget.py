@@ -165,7 +165,7 @@ def budget_sentences(fit: FitView) -> tuple[str, ...]:
     better, now = better_known(fit, worst), budget(fit).loc[worst, "combined"]
     factors = join([f"{label} {factor:.2g} times" for label, factor in wider.items()])
     return (
-        "The intervals assume a set-up that is known perfectly. As well as it is known, standard "
+        "The intervals assume a set-up that is known perfectly. With what it is known to, standard "
         f"uncertainties are larger: {factors}. Most of that of {worst} comes from the "
         f"{better.meaning}, known to {better.known}; known to {better.half}, it would leave "
         f"{better.combined:.2g} instead of {now:.2g}.",

@@ -81,7 +81,7 @@ def test_it_is_kept_in_a_file_and_the_verdict_notes_it(fit: xr.DataTree, tmp_pat
     np.testing.assert_allclose(pb.budget(loaded), pb.budget(fit))
     (sentence,) = budget_sentences(loaded)
     assert sentence in pb.verdict(loaded).findings
-    assert sentence.startswith("The intervals assume a set-up that is known perfectly. As well as")
+    assert sentence.startswith("The intervals assume a set-up that is known perfectly. With what")
     assert "comes from the gain of polarization, known to 0.01; known to 0.005, it" in sentence
 
 
