@@ -1,6 +1,6 @@
 """Do intervals hold where the set-up is off by what it is known to: without, and with its budget?
 
-    python benchmarks/setup_budget.py camera --captures 60
+    python benchmarks/setup_budget.py camera --captures 90
 
 Materials of one color are simulated in a set-up; each quantity of its budget is off by an amount
 drawn from its standard uncertainty, so that the capture states wrong angles or readings. Every
@@ -34,7 +34,7 @@ def recorded(capture: xr.Dataset, scene: str, rng: np.random.Generator) -> xr.Da
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", choices=[name for name, own in SETUPS.items() if own.known])
-    parser.add_argument("--captures", type=int, default=60)
+    parser.add_argument("--captures", type=int, default=90)
     parser.add_argument("--method", default="importance")
     asked = parser.parse_args()
     held: dict[str, list[tuple[bool, bool, float]]] = defaultdict(list)
