@@ -14,7 +14,7 @@ CODE = {
     "capture": 909,
     "cli": 1151,
     "design": 1072,
-    "diagnostics": 1783,
+    "diagnostics": 1796,
     "importers": 1289,
     "inference": 2886,
     "maps": 1734,
@@ -26,14 +26,14 @@ CODE = {
     "scenes": 1670,
     "own files": 1496,
     "models": 320,
-    "tests": 23109,
+    "tests": 23122,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 24012,
+    "code": 24025,
     "classes": 346,
-    "constants": 422,
+    "constants": 423,
     "Any": 172,
     "longest function": 80,
 }

@@ -26,6 +26,7 @@ from polar_bayes.errors import FitError
 from polar_bayes.frames import PrintedFrame
 
 INPUT_SHIFTS = "input_shifts"
+STATISTICS = ["shift", "mcse"]
 OWN = ("noise", "prior")
 """Of the posterior's own variance."""
 
@@ -59,7 +60,7 @@ def budget(
             where="budget: result",
             hint="fit with a set-up whose `known` lists input quantities, such as camera",
         )
-    group = fit.result[INPUT_SHIFTS].to_dataset()
+    group = _stated(fit)
     stated = group["standard_uncertainty"].to_series()
     asked = _asked(stated, known or {})
     shifts = {each.label: each.draws for each in _shifts(group)}
@@ -76,6 +77,21 @@ def budget(
     table.attrs["mcse"] = errors
     table["combined"] = np.sqrt(table["sd"] ** 2 + _squares(table).sum(axis=1))
     return table
+
+
+def _stated(fit: FitView) -> xr.Dataset:
+    """The group of shifts; the schema checks its types, and this its labels and uncertainties."""
+    group = fit.result[INPUT_SHIFTS].to_dataset()
+    labels = [group[dim].to_numpy().tolist() for dim in ("statistic", "quantity")]
+    u = group["standard_uncertainty"].to_numpy().astype(float)
+    if (
+        labels[0] != STATISTICS
+        or len({*labels[1]}) < u.size
+        or not (np.isfinite(u) & (u > 0)).all()
+    ):
+        hint = "fit again: labels and standard uncertainties are not as a fit writes them"
+        raise FitError("it states no input quantities", where=INPUT_SHIFTS, hint=hint)
+    return group
 
 
 def _squares(table: pd.DataFrame) -> pd.DataFrame:
@@ -105,7 +121,7 @@ def _asked(stated: pd.Series, known: Mapping[str, float]) -> pd.Series:
 def _shifts(group: xr.Dataset) -> list[Scalar]:
     """Of every parameter, the shift by each quantity and its Monte Carlo error, (2, quantity)."""
     own = group.drop_vars(["standard_uncertainty", "unit", "meaning"])
-    return scalars(own.sel(statistic=["shift", "mcse"]), ("statistic", "quantity"))
+    return scalars(own, ("statistic", "quantity"))
 
 
 def _own_parts(fit: FitView, scalar: Scalar, sd: float) -> tuple[float, float]:

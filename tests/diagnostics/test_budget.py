@@ -133,6 +133,21 @@ def test_what_cannot_be_known_is_refused(fit: xr.DataTree, known: dict, message:
     assert str(caught.value).startswith(message)
 
 
+@each(
+    "damage",
+    [
+        lambda group: group.assign_coords(statistic=["shift", "shift"]),
+        lambda group: group.assign_coords(quantity=["sample_lean"] * 4),
+        lambda group: group.assign(standard_uncertainty=0.0 * group["standard_uncertainty"]),
+    ],
+    ids=["statistic", "quantity", "uncertainty"],
+)
+def test_a_group_that_no_fit_wrote_is_refused(fit: xr.DataTree, damage) -> None:
+    fit["input_shifts"] = xr.DataTree(damage(fit["input_shifts"].to_dataset()))
+    with pytest.raises(pb.FitError, match="input_shifts: it states no input quantities; fit again"):
+        pb.verdict(fit)
+
+
 def test_a_set_up_that_states_nothing_has_no_budget(capture: xr.Dataset) -> None:
     silent = pb.fit(capture, scene=setup(), **ASKED)
     assert budget_sentences(silent) == ()
