@@ -21,8 +21,9 @@ import polar_bayes as pb
 # ## A small calibration
 #
 # Of the capture only the layout counts: which views, which readings, which errors. Here a polished
-# plate at 12 angles, and 200 simulations. (The [numbers to quote](../calibration.md#what-it-showed)
-# come from a thousand and more, of the paper's scene.)
+# plate at 12 angles, and 200 simulations. (The
+# [numbers to quote](../calibration.md#what-it-costs-and-what-it-showed) come from a thousand and
+# more, of the paper's scene.)
 
 # %%
 plate = pb.Scene(pb.SmoothSurface(), pb.Unpolarized(), pb.StokesMixing())

@@ -9,12 +9,12 @@ from cases import each
 ROOT = Path(__file__).parents[1]
 
 CODE = {
-    "benchmark": 588,
+    "benchmark": 587,
     "calibration": 1075,
     "capture": 909,
     "cli": 1151,
     "design": 1072,
-    "diagnostics": 1796,
+    "diagnostics": 1795,
     "importers": 1289,
     "inference": 2886,
     "maps": 1734,
@@ -22,7 +22,7 @@ CODE = {
     "numerics": 884,
     "observation": 491,
     "physics": 2384,
-    "reporting": 3028,
+    "reporting": 3037,
     "scenes": 1670,
     "own files": 1496,
     "models": 320,
@@ -31,7 +31,7 @@ CODE = {
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 24025,
+    "code": 24032,
     "classes": 346,
     "constants": 423,
     "Any": 172,

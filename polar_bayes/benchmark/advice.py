@@ -100,11 +100,10 @@ def accuracy_view(result: Study) -> AccuracyView:
     check = FIT.check if is_fit and "accuracy" in result.children else STUDY.check
     check(result, "accuracy")
     found = result["accuracy"].to_dataset().transpose("row", "parameter", ...)
-    if pd.MultiIndex.from_arrays(
-        [found[name].to_numpy() for name in ("method", "override")]
-    ).has_duplicates:
-        hint = "give what polar_bayes.accuracy returned"
-        raise FitError("two rows have one name", where="accuracy", hint=hint)
+    for what, names in {"rows": ("method", "override"), "parameters": ("parameter",)}.items():
+        if pd.MultiIndex.from_arrays([found[name].to_numpy() for name in names]).has_duplicates:
+            hint = "give what polar_bayes.accuracy returned"
+            raise FitError(f"two {what} have one name", where="accuracy", hint=hint)
     return AccuracyView(found)
 
 

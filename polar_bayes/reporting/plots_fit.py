@@ -181,7 +181,14 @@ def plot_prior_posterior(result: xr.DataTree | FitView) -> Figure:
         FitError: The tree holds no prior, or no parameter moves.
     """
     fit = view_of(result)
-    found = [scalar for scalar in drawable(fit) if scalar.label in fit.prior]
+    limits = {
+        scalar.label: style.padded_range(
+            np.concatenate([np.quantile(x, [0.01, 0.99]), scalar.draws.ravel()]), 0.04
+        )
+        for scalar in drawable(fit)
+        if scalar.label in fit.prior and np.isfinite(x := fit.prior[scalar.label].draws).all()
+    }
+    found = [each for each in drawable(fit) if np.isfinite(limits.get(each.label, np.nan)).all()]
     if not found:
         raise _nothing_to_draw("plot_prior_posterior", "draws of the prior")
     # Populations and processes, which concern all members, before the first members.
@@ -193,10 +200,9 @@ def plot_prior_posterior(result: xr.DataTree | FitView) -> Figure:
     any_truth = False
     for axes, scalar in zip(panels, found, strict=True):
         prior, draws = fit.prior[scalar.label].draws.ravel(), scalar.draws.ravel()
-        values = np.concatenate([np.quantile(prior, [0.01, 0.99]), draws])
-        limits = style.padded_range(values, 0.04)
-        _scaled_histogram(axes, prior, limits, GRAY, 0.72)
-        _scaled_histogram(axes, draws, limits, BLUE, 0.45)
+        ends = limits[scalar.label]
+        _scaled_histogram(axes, prior, ends, GRAY, 0.72)
+        _scaled_histogram(axes, draws, ends, BLUE, 0.45)
         low, middle, high = np.quantile(draws, [0.025, 0.5, 0.975])
         axes.plot([low, high], [-0.09, -0.09], color=BLUE, lw=3, solid_capstyle="butt")
         axes.plot([middle], [-0.09], "|", color=style.text_color(), ms=8)
@@ -204,7 +210,7 @@ def plot_prior_posterior(result: xr.DataTree | FitView) -> Figure:
         if np.isfinite(true):
             any_truth = True
             axes.axvline(true, color=ORANGE, lw=1.6, ls="--")
-        axes.set(xlim=limits, ylim=(-0.18, 1.08), yticks=[])
+        axes.set(xlim=ends, ylim=(-0.18, 1.08), yticks=[])
         axes.spines["left"].set_visible(False)
         axes.locator_params(axis="x", nbins=5)
         style.set_panel_title(axes, parameter_title(scalar, fit.posterior))
@@ -263,7 +269,10 @@ def _scaled_histogram(
 ) -> None:
     """A histogram over its own range, scaled to height 1."""
     inside = values[(values >= limits[0]) & (values <= limits[1])]
-    counts, edges = np.histogram(inside, 16 if inside.size < 1000 else 30)
+    bins = 16 if inside.size < 1000 else 30
+    largest = np.abs(inside).max(initial=0.0)
+    is_wide = inside.size > 0 and np.ptp(inside) > 4.0 * bins * np.spacing(largest)
+    counts, edges = np.histogram(inside, bins if is_wide else 1)
     heights = counts / max(counts.max(), 1)  # nothing may be inside
     axes.stairs(heights, edges, fill=True, color=lighten(color, share))
     axes.stairs(heights, edges, color=color, lw=0.8)
