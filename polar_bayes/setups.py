@@ -40,6 +40,8 @@ from polar_bayes.priors import (
 )
 from polar_bayes.repr_html import HTMLRepr
 
+__all__ = ["SETUPS", "Setup", "prior_table"]
+
 
 @dataclasses.dataclass(frozen=True)
 class Setup(HTMLRepr):

@@ -39,6 +39,8 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import RANGES
 from polar_bayes.setups import SETUPS, Setup, find_setup, setup_name
 
+__all__ = ["PRESETS", "Material", "Protocol"]
+
 REFERENCE_WAVELENGTHS = (450.0, 550.0, 650.0)
 
 

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 CODE = {
     "benchmark": 587,
     "calibration": 1075,
-    "capture": 909,
+    "capture": 919,
     "cli": 1151,
     "design": 1072,
     "diagnostics": 1795,
@@ -24,14 +24,14 @@ CODE = {
     "physics": 2384,
     "reporting": 3037,
     "scenes": 1670,
-    "own files": 1496,
+    "own files": 1498,
     "models": 320,
     "tests": 23122,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 24032,
+    "code": 24044,
     "classes": 346,
     "constants": 423,
     "Any": 172,

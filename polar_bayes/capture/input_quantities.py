@@ -18,6 +18,17 @@ import xarray as xr
 
 from polar_bayes.errors import FitError
 
+__all__ = [
+    "AmbientLight",
+    "AnalyzerRoll",
+    "LightAzimuth",
+    "LightZenith",
+    "PolarizationGain",
+    "SampleLean",
+    "ToneCurve",
+    "ViewZenithScale",
+]
+
 POLARIZATION = ("dop", "q", "u")
 
 
