@@ -22,7 +22,7 @@ CODE = {
     "numerics": 884,
     "observation": 491,
     "physics": 2384,
-    "reporting": 3037,
+    "reporting": 3038,
     "scenes": 1670,
     "own files": 1498,
     "models": 320,
@@ -31,7 +31,7 @@ CODE = {
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 24044,
+    "code": 24045,
     "classes": 346,
     "constants": 423,
     "Any": 172,

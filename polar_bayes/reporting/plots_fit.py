@@ -271,8 +271,9 @@ def _scaled_histogram(
     inside = values[(values >= limits[0]) & (values <= limits[1])]
     bins = 16 if inside.size < 1000 else 30
     largest = np.abs(inside).max(initial=0.0)
-    is_wide = inside.size > 0 and np.ptp(inside) > 4.0 * bins * np.spacing(largest)
-    counts, edges = np.histogram(inside, bins if is_wide else 1)
+    counts, edges = np.array([inside.size]), np.array(limits)
+    if inside.size and np.ptp(inside) > 4.0 * bins * np.spacing(largest):  # numbers between them
+        counts, edges = np.histogram(inside, bins)
     heights = counts / max(counts.max(), 1)  # nothing may be inside
     axes.stairs(heights, edges, fill=True, color=lighten(color, share))
     axes.stairs(heights, edges, color=color, lw=0.8)
