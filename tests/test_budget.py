@@ -11,18 +11,18 @@ ROOT = Path(__file__).parents[1]
 CODE = {
     "benchmark": 587,
     "calibration": 1075,
-    "capture": 919,
+    "capture": 918,
     "cli": 1151,
     "design": 1072,
-    "diagnostics": 1797,
+    "diagnostics": 1795,
     "importers": 1289,
-    "inference": 2886,
+    "inference": 2887,
     "maps": 1734,
     "methods": 1252,
     "numerics": 884,
     "observation": 491,
     "physics": 2384,
-    "reporting": 3038,
+    "reporting": 3039,
     "scenes": 1670,
     "own files": 1498,
     "models": 320,
@@ -31,8 +31,8 @@ CODE = {
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 24047,
-    "classes": 346,
+    "code": 24046,
+    "classes": 347,
     "constants": 423,
     "Any": 172,
     "longest function": 80,

@@ -10,6 +10,7 @@ uncertainty.
 
 import abc
 import dataclasses
+import math
 from numbers import Real
 from typing import ClassVar, Self, override
 
@@ -32,6 +33,12 @@ __all__ = [
 POLARIZATION = ("dop", "q", "u")
 
 
+def check_uncertainty(u: object, where: str, unit: str = "") -> None:
+    """Raise FitError where a value is no standard uncertainty."""
+    if not (isinstance(u, Real) and 0.0 < float(u) < math.inf):
+        raise FitError(f"it is {u!r}", where=where, hint=f"give a number above 0{unit}")
+
+
 @dataclasses.dataclass(frozen=True)
 class AbstractInputQuantity(abc.ABC):
     """Something that a set-up is known to.
@@ -47,10 +54,8 @@ class AbstractInputQuantity(abc.ABC):
     meaning: ClassVar[str]
 
     def __post_init__(self) -> None:
-        u = self.standard_uncertainty
-        if not (isinstance(u, Real) and np.isfinite(u) and u > 0.0):
-            where = f"{type(self).__name__}: standard_uncertainty"
-            raise FitError(f"it is {u!r}", where=where, hint=f"give a number above 0 ({self.unit})")
+        where = f"{type(self).__name__}: standard_uncertainty"
+        check_uncertainty(self.standard_uncertainty, where, f" ({self.unit})")
 
     def as_stated(self, capture: xr.Dataset) -> Self:
         """The same with the standard uncertainty that a capture states, as `<name>_uncertainty`."""
@@ -68,29 +73,30 @@ class AbstractInputQuantity(abc.ABC):
 
 
 @dataclasses.dataclass(frozen=True)
-class LightZenith(AbstractInputQuantity):
-    """The light is that much further from the normal than stated."""
+class _Angle(AbstractInputQuantity):
+    """An angle of the capture, by its name, is that much larger than stated."""
 
-    name = "light_zenith"
     unit = "degree"
-    meaning = "zenith of the light"
 
     @override
     def shifted(self, capture: xr.Dataset, amount: float) -> xr.Dataset:
-        return capture.assign(light_zenith=capture["light_zenith"] + amount)
+        return capture.assign({self.name: capture[self.name] + amount})
 
 
 @dataclasses.dataclass(frozen=True)
-class LightAzimuth(AbstractInputQuantity):
+class LightZenith(_Angle):
+    """The light is that much further from the normal than stated."""
+
+    name = "light_zenith"
+    meaning = "zenith of the light"
+
+
+@dataclasses.dataclass(frozen=True)
+class LightAzimuth(_Angle):
     """The light is turned about the normal by that much."""
 
     name = "light_azimuth"
-    unit = "degree"
     meaning = "azimuth of the light"
-
-    @override
-    def shifted(self, capture: xr.Dataset, amount: float) -> xr.Dataset:
-        return capture.assign(light_azimuth=capture["light_azimuth"] + amount)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from polar_bayes.capture.input_quantities import check_uncertainty
 from polar_bayes.diagnostics.finding import join
 from polar_bayes.diagnostics.limits import LIMITS
 from polar_bayes.diagnostics.parameters import Scalar, scalars
@@ -24,9 +25,9 @@ from polar_bayes.diagnostics.sensitivity import total_density
 from polar_bayes.diagnostics.view import FitView, once, view_of
 from polar_bayes.errors import FitError
 from polar_bayes.frames import PrintedFrame
+from polar_bayes.inference.input_sensitivity import STATISTICS
 
 INPUT_SHIFTS = "input_shifts"
-STATISTICS = ["shift", "mcse"]
 OWN = ("noise", "prior")
 """Of the posterior's own variance."""
 
@@ -85,7 +86,7 @@ def _stated(fit: FitView) -> xr.Dataset:
     labels = [group[dim].to_numpy().tolist() for dim in ("statistic", "quantity")]
     u = group["standard_uncertainty"].to_numpy().astype(float)
     if (
-        labels[0] != STATISTICS
+        labels[0] != list(STATISTICS)
         or len({*labels[1]}) < u.size
         or not (np.isfinite(u) & (u > 0)).all()
     ):
@@ -113,8 +114,7 @@ def _asked(stated: pd.Series, known: Mapping[str, float]) -> pd.Series:
         if name not in stated.index:
             hint = f"give some of {join(list(stated.index))}"
             raise FitError("it is no input quantity of this fit", where=f"known: {name}", hint=hint)
-        if not (np.isscalar(value) and np.isreal(value) and np.isfinite(value) and value > 0.0):
-            raise FitError(f"it is {value!r}", where=f"known: {name}", hint="give a number above 0")
+        check_uncertainty(value, f"known: {name}")
     return pd.Series({**stated.to_dict(), **known}, dtype=float)
 
 

@@ -28,6 +28,9 @@ from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import dims_of, shape_of
 from polar_bayes.observation.data import Observations, observe
 
+STATISTICS = ("shift", "mcse")
+"""What is known of every parameter and quantity: the shift and its Monte Carlo standard error."""
+
 
 def mean_shifts(
     request: Request,
@@ -77,7 +80,7 @@ def mean_shifts(
     }
     stated = ("standard_uncertainty", "unit", "meaning")
     of_each = {name: ("quantity", [getattr(each, name) for each in quantities]) for name in stated}
-    labels = {"statistic": ["shift", "mcse"], "quantity": [each.name for each in quantities]}
+    labels = {"statistic": list(STATISTICS), "quantity": [each.name for each in quantities]}
     return xr.Dataset(found | of_each, coords=labels)
 
 

@@ -181,14 +181,15 @@ def plot_prior_posterior(result: xr.DataTree | FitView) -> Figure:
         FitError: The tree holds no prior, or no parameter moves.
     """
     fit = view_of(result)
+    shown = drawable(fit)
     limits = {
         scalar.label: style.padded_range(
             np.concatenate([np.quantile(x, [0.01, 0.99]), scalar.draws.ravel()]), 0.04
         )
-        for scalar in drawable(fit)
+        for scalar in shown
         if scalar.label in fit.prior and np.isfinite(x := fit.prior[scalar.label].draws).all()
     }
-    found = [each for each in drawable(fit) if np.isfinite(limits.get(each.label, np.nan)).all()]
+    found = [each for each in shown if np.isfinite(limits.get(each.label, np.nan)).all()]
     if not found:
         raise _nothing_to_draw("plot_prior_posterior", "draws of the prior")
     # Populations and processes, which concern all members, before the first members.
