@@ -17,7 +17,6 @@ from . import setups as setups
 from . import simulation as simulation
 from .benchmark.accuracy import accuracy as accuracy
 from .calibration.calibrate import calibrate as calibrate
-from .capture import input_quantities as input_quantities
 from .capture.files import (
     load_capture as load_capture,
     save_capture as save_capture,
@@ -41,6 +40,7 @@ from .importers.images import (
 from .importers.table import from_table as from_table
 from .maps.fit_map import fit_pixels as fit_pixels
 from .observation import links as links
+from .physics import input_quantities as input_quantities
 from .physics import instrument as instrument
 from .physics.coat import (
     ClearCoat as ClearCoat,

@@ -555,6 +555,16 @@ _ROWS: dict[str, dist.Distribution] = {
     # Smooth errors of some percent are usual, and none is possible; one in 400 is worse than 36%.
     "discrepancy_amplitude": HalfNormal(0.12),
     "discrepancy_weights": dist.Normal(0.0, 1.0).expand([3]).to_event(1),
+    # What a set-up is known to: a lamp placed by eye, the pose of a printed board, an analyzer set
+    # by its mark. Ambient light only adds.
+    "light_zenith_offset": dist.Normal(0.0, 1.0),
+    "light_azimuth_offset": dist.Normal(0.0, 1.0),
+    "view_zenith_scale_offset": dist.Normal(0.0, 0.005),
+    "sample_lean_offset": dist.Normal(0.0, 0.2),
+    "analyzer_roll_offset": dist.Normal(0.0, 0.3),
+    "polarization_gain_offset": dist.Normal(0.0, 0.005),
+    "ambient_light_offset": HalfNormal(0.005),
+    "tone_curve_offset": dist.Normal(0.0, 0.01),
     # The noise: scales that the data themselves determine. None may reach zero: where the scene
     # can match a few readings exactly, a scale of zero would have infinite posterior density.
     "concentration_scale": dist.LogNormal(math.log(200.0), 1.0),

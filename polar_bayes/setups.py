@@ -4,7 +4,9 @@
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping
+from numbers import Real
 from types import MappingProxyType
 
 import jax
@@ -13,20 +15,19 @@ import pandas as pd
 import xarray as xr
 from numpyro import distributions as dist
 
-from polar_bayes.capture.input_quantities import (
+from polar_bayes.errors import FitError, SceneError
+from polar_bayes.frames import PrintedFrame
+from polar_bayes.observation.links import AbstractLink, BetaLink, StokesLink, StudentTLink
+from polar_bayes.physics.input_quantities import (
+    AbstractInputQuantity,
     AmbientLight,
     AnalyzerRoll,
-    InputQuantities,
     LightAzimuth,
     LightZenith,
     PolarizationGain,
-    SampleLean,
     ToneCurve,
     ViewZenithScale,
 )
-from polar_bayes.errors import SceneError
-from polar_bayes.frames import PrintedFrame
-from polar_bayes.observation.links import AbstractLink, BetaLink, StokesLink, StudentTLink
 from polar_bayes.physics.instrument import Discrepancy
 from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import SCENES, Scene
@@ -53,7 +54,8 @@ class Setup(HTMLRepr):
         largest_view_zenith: Views beyond it are set aside and counted. Unit degree.
         priors: Distributions that replace those of `polar_bayes.PRIORS` in this set-up.
         shared: Instrument parameters that the pixels of an image share by default.
-        known: What it is known to, which no reading tells: `pb.budget` propagates it.
+        known: Input quantities that every scene of this set-up has beside its own instrument;
+            the widths of their priors are their standard uncertainties.
     """
 
     scene: Scene
@@ -61,7 +63,7 @@ class Setup(HTMLRepr):
     largest_view_zenith: float = 90.0
     priors: Mapping[str, dist.Distribution] = dataclasses.field(default_factory=dict)
     shared: tuple[str, ...] = ()
-    known: InputQuantities = ()
+    known: tuple[AbstractInputQuantity, ...] = ()
 
 
 # A bare surface is as common as any body, and where it is one, the index must not follow a fraction
@@ -77,15 +79,13 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
             SCENES["camera"],
             {"q": StokesLink(), "u": StokesLink(), "intensity": StudentTLink()},
             shared=("dolp_gain",),  # one polarizer took the image
-            # A lamp placed by eye, the pose of a printed board, an analyzer set by its mark.
-            known=(
-                LightZenith(1.0),
-                LightAzimuth(1.0),
-                ViewZenithScale(0.005),
-                AnalyzerRoll(0.3),
-                PolarizationGain(0.005),
-                AmbientLight(0.005),
-                ToneCurve(0.01),
+            known=(  # the gain of polarization is in `dolp_gain`
+                LightZenith(),
+                LightAzimuth(),
+                ViewZenithScale(),
+                AnalyzerRoll(),
+                AmbientLight(),
+                ToneCurve(),
             ),
         ),
         # The irradiance of a pixel is unknown, so brightness carries no information; the noise of
@@ -95,7 +95,7 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
             {"q": StokesLink(stated_errors=True), "u": StokesLink(stated_errors=True)},
             # A fraction of .009 dilutes the polarization of a mirror by a fifth already.
             priors=MAYBE_BARE,
-            known=(AnalyzerRoll(0.3), PolarizationGain(0.005), ToneCurve(0.01)),
+            known=(AnalyzerRoll(), PolarizationGain(), ToneCurve()),
         ),
         # A laser beam grows longer than the sample towards grazing, each channel losing its own
         # share: beyond 78 degrees a plate's readings say more about its size than its index.
@@ -105,14 +105,6 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
             largest_view_zenith=78.0,
             # A plate with an opaque back sends nothing from below: zero must not be an outlier.
             priors={"subsurface_fraction": Beta(1.0, 3.0)},
-            # A rotary stage and a sample against its stop; a photodiode in a dark room.
-            known=(
-                SampleLean(0.2),
-                ViewZenithScale(0.002),
-                PolarizationGain(0.005),
-                AmbientLight(0.002),
-                ToneCurve(0.005),
-            ),
         ),
     }
 )
@@ -130,7 +122,8 @@ def find_setup(name: str | Setup) -> Setup:
 
 def setup_name(setup: Setup) -> str:
     """The name of the set-up that has this scene, or "custom"."""
-    return next((name for name, own in SETUPS.items() if own.scene == setup.scene), "custom")
+    scene = setup.scene.perfectly_known
+    return next((name for name, own in SETUPS.items() if own.scene == scene), "custom")
 
 
 def default_priors(setup: Setup, capture: xr.Dataset) -> dict[str, dist.Distribution]:
@@ -143,6 +136,45 @@ def default_priors(setup: Setup, capture: xr.Dataset) -> dict[str, dist.Distribu
         if isinstance(term, Discrepancy):  # as many weights as it has basis functions
             priors["discrepancy_weights"] = dist.Normal(0.0, 1.0).expand([term.basis]).to_event(1)
     return {name: prior for name, prior in priors.items() if name in setup.scene.parameters}
+
+
+def priors_known_to(
+    known: Mapping[str, float] | None, capture: xr.Dataset, usual: Mapping[str, dist.Distribution]
+) -> dict[str, dist.Distribution]:
+    """Priors of what a caller, or else a capture, says that the set-up is known to.
+
+    Args:
+        known: Standard uncertainties by input quantity, such as `{"light_zenith": 0.2}`.
+        capture: Its attributes `light_zenith_uncertainty` and so on state the same.
+        usual: The priors of the scene's parameters.
+
+    Raises:
+        FitError: There is no such quantity, or what is stated is no standard uncertainty.
+    """
+    names = {name.removesuffix("_offset"): name for name in usual if _is_error(usual[name])}
+    stated = {name: capture.attrs.get(f"{name}_uncertainty") for name in names}
+    stated = {name: u for name, u in stated.items() if u is not None} | dict(known or {})
+    found = {}
+    for name, u in stated.items():
+        where = f"known: {name}" if name in (known or {}) else f"capture: {name}_uncertainty"
+        if name not in names:
+            hint = f"give some of {', '.join(names)}" if names else "a scene's terms state them"
+            raise FitError("no input quantity of this scene", where=where, hint=hint)
+        check_uncertainty(u, where)
+        found[names[name]] = type(usual[names[name]])(scale=float(u))
+    return found
+
+
+def check_uncertainty(u: object, where: str) -> None:
+    """Raise FitError where a value is no standard uncertainty."""
+    if not isinstance(u, Real) or isinstance(u, bool) or not 0.0 < float(u) < math.inf:
+        raise FitError(f"it is {u!r}", where=where, hint="give a number above 0")
+
+
+def _is_error(prior: dist.Distribution) -> bool:
+    """Whether a prior is that of something which is zero in a perfect set-up."""
+    is_centered = isinstance(prior, dist.Normal) and np.ndim(prior.loc) == 0 and prior.loc == 0.0
+    return is_centered or isinstance(prior, dist.HalfNormal)
 
 
 def prior_table(

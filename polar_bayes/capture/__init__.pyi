@@ -1,4 +1,3 @@
-from . import input_quantities as input_quantities
 from .combine import combine as combine
 from .files import load_capture as load_capture, save_capture as save_capture
 from .plausibility import (

@@ -11,10 +11,10 @@ from polar_bayes.cli.options import (
     MANY_METHOD,
     RESULT_FILE,
     STUDY_METHOD,
-    Assignment,
     capture_argument,
     command,
     json_option,
+    known_option,
     model_option,
     option,
     out_option,
@@ -148,29 +148,16 @@ def identify(
 
 @command()
 @click.argument("fit", type=INPUT)
-@option(
-    "--known", type=Assignment(is_named=True), multiple=True, metavar="NAME=UNCERTAINTY",
-    help="What an input quantity is known to, such as --known light_zenith=0.2; once for each.",
-)  # fmt: skip
+@known_option
 @json_option
-def budget(fit: Path, known: tuple[tuple[str, str], ...], as_json: bool) -> None:
+def budget(fit: Path, known: dict[str, float], as_json: bool) -> None:
     """How much of each uncertainty comes from noise, from the prior and from the set-up."""
-    table = pb.budget(
-        pb.load(fit, "fit"), known={name: _number(name, text) for name, text in known}
-    )
+    table = pb.budget(pb.load(fit, "fit"), known=known)
     if as_json:
         print_json({"known": table.attrs["known"], "parameters": json_rows(table)})
         return
     known_to = ", ".join(f"{name} {value:g}" for name, value in table.attrs["known"].items())
     print_frame(table.T, [f"Known to: {known_to}."])
-
-
-def _number(name: str, text: str) -> float:
-    try:
-        return float(text)
-    except ValueError as error:
-        hint = "write it as --known light_zenith=0.2"
-        raise pb.FitError("it is no number", where=f"--known {name}={text}", hint=hint) from error
 
 
 @command()

@@ -22,6 +22,7 @@ from polar_bayes.cli.options import (
     capture_argument,
     command,
     json_option,
+    known_option,
     link_option,
     model_option,
     nuts_options,
@@ -108,6 +109,7 @@ def _make_folder(folder: Path) -> None:
 )  # fmt: skip
 @prior_option
 @link_option
+@known_option
 @view_limit_option
 @option("--choose-effects", "choose", is_flag=True, help="Fit what `effects` would keep.")
 @option("--tolerance", type=float, help="Of --choose-effects and --method auto; 0.1 sd.")

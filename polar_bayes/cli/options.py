@@ -13,7 +13,14 @@ import click
 from click.core import ParameterSource
 
 import polar_bayes as pb
-from polar_bayes.errors import CaptureError, FitError, OutputError, PolarBayesError, SceneError
+from polar_bayes.errors import (
+    CaptureError,
+    FitError,
+    OutputError,
+    PolarBayesError,
+    SceneError,
+    one_line,
+)
 from polar_bayes.methods.registry import method_names
 from polar_bayes.paths import as_path, check_output, is_scene_file, refuse_inputs
 
@@ -192,6 +199,24 @@ prior_option = option(
 link_option = option(
     "--link", "links", type=Assignment(is_named=False), multiple=True, metavar="[VARIABLE=]LINK",
     help="Such as 'q=StokesLink(degrees_of_freedom=4)'; once per variable.",
+)  # fmt: skip
+
+
+def _standard_uncertainties(
+    ctx: Context, param: Param, value: tuple[tuple[str, str], ...]
+) -> dict[str, float]:
+    """NAME=NUMBER, given several times, as a mapping."""
+    try:
+        return {name: float(text) for name, text in value}
+    except ValueError as error:
+        hint = "write it as --known light_zenith=0.2"
+        raise FitError(f"{one_line(str(error))}", where="--known", hint=hint) from error
+
+
+known_option = option(
+    "--known", type=Assignment(is_named=True), multiple=True, metavar="NAME=UNCERTAINTY",
+    callback=_standard_uncertainties,
+    help="What an input quantity is known to, such as --known light_zenith=0.2; once for each.",
 )  # fmt: skip
 view_limit_option = option(
     "--largest-view-zenith", type=float, help="Set aside views beyond it [degrees]."

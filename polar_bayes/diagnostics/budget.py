@@ -1,10 +1,14 @@
-"""The uncertainty budget of a fit: how much of each interval is noise, prior and set-up.
+r"""The uncertainty budget of a fit: how much of each interval is noise, prior and set-up.
 
-The rows are in the words of the GUM: each input quantity of the set-up has a standard uncertainty,
-whose contribution to a parameter is the change of the posterior mean where the quantity is off by
-it. Contributions add in squares, to the combined standard uncertainty. The posterior's own variance
-is divided between the noise of the readings and the prior as power scaling divides it; of a normal
-posterior these are the noise and smoothing errors of an optimal estimate.
+The rows are in the words of the GUM: each input quantity of the set-up has a standard uncertainty
+u, that of its prior, and contributes to a parameter
+
+$$ c = \operatorname{Cov}(\theta, e) / u $$
+
+over the posterior. Of a normal posterior the squares of all contributions add to the variance: each
+factor of the density, with precision P, contributes $\Sigma P \Sigma$ to the covariance $\Sigma$.
+What is left is divided between the noise of the readings and the other priors as power scaling
+divides it. These are the noise and smoothing errors of an optimal estimate.
 
 Source: JCGM 100:2008 (GUM), 5.1; Rodgers (2000), Inverse Methods for Atmospheric Sounding, 3.2;
 Kallioinen et al. (2024), Statistics and Computing 34, 57 (power scaling).
@@ -17,19 +21,18 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from polar_bayes.capture.input_quantities import check_uncertainty
 from polar_bayes.diagnostics.finding import join
 from polar_bayes.diagnostics.limits import LIMITS
-from polar_bayes.diagnostics.parameters import Scalar, scalars
+from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.diagnostics.sensitivity import total_density
 from polar_bayes.diagnostics.view import FitView, once, view_of
 from polar_bayes.errors import FitError
 from polar_bayes.frames import PrintedFrame
-from polar_bayes.inference.input_sensitivity import STATISTICS
+from polar_bayes.physics.part import notation
+from polar_bayes.setups import check_uncertainty
 
-INPUT_SHIFTS = "input_shifts"
 OWN = ("noise", "prior")
-"""Of the posterior's own variance."""
+"""What contributes beside the set-up."""
 
 
 def budget(
@@ -37,75 +40,78 @@ def budget(
 ) -> pd.DataFrame:
     """How much of the uncertainty of each material parameter comes from what.
 
-    Intervals of a fit take the set-up for perfectly known, but for what its scene estimates. This
-    table says what they leave out, to first order, without another fit.
-
     Args:
-        result: A fit, fresh or loaded, of a set-up that states what it is known to (`Setup.known`).
-        known: Other standard uncertainties, by input quantity, in its unit; above 0.
+        result: A fit, fresh or loaded, whose scene has input quantities or other terms of an
+            instrument.
+        known: Other standard uncertainties, by input quantity, in its unit; above 0. What they
+            would do to the posterior is told to first order, without another fit.
 
     Returns:
         A row for each scalar parameter of the material, in its unit: the posterior's standard
-        deviation `sd` with its parts `noise` and `prior` (squares add to that of `sd`), the
-        contribution of each input quantity, which has a sign, and the `combined` standard
-        uncertainty. The attribute `known` has the standard uncertainties of the quantities, `mcse`
-        the Monte Carlo standard errors of their contributions.
+        deviation `sd`; `perfect`, what it would be in a set-up known perfectly; and what
+        contributes to `sd`, in squares: the `noise`, the `prior`, and each input quantity, which
+        has a sign. The attribute `known` has the standard uncertainties of the quantities.
 
     Raises:
-        FitError: The result is no fit, its set-up states nothing, or has no such input quantity.
+        FitError: The result is no fit, its scene has no input quantity, or none of that name.
     """
     fit = view_of(result)
-    if INPUT_SHIFTS not in fit.result.children or fit.method == "point":
+    if not has_budget(fit):
         raise FitError(
             "it does not say what its set-up is known to",
             where="budget: result",
-            hint="fit with a set-up whose `known` lists input quantities, such as camera",
+            hint="fit with a set-up whose scene has input quantities, such as camera",
         )
-    group = _stated(fit)
-    stated = group["standard_uncertainty"].to_series()
+    errors = _errors(fit)
+    stated = pd.Series({name: fit.provenance["known"][each.name] for name, each in errors.items()})
     asked = _asked(stated, known or {})
-    shifts = {each.label: each.draws for each in _shifts(group)}
-    rows, errors = {}, {}
+    rows = {}
     for scalar in fit.scalars:
-        if scalar.is_material and scalar.label in shifts:
-            parts, error = shifts[scalar.label] * (asked / stated).to_numpy()
-            errors[scalar.label] = dict(zip(stated.index, error.tolist(), strict=True))
-            sd = float(scalar.draws.std(ddof=1))
-            rows[scalar.label] = [sd, *_own_parts(fit, scalar, sd), *parts]
-    columns = ["sd", *OWN, *stated.index]
+        if scalar.is_material:
+            with np.errstate(all="ignore"):  # draws of a damaged file may be huge
+                rows[scalar.label] = _row(fit, scalar, list(errors.values()), stated, asked)
+    columns = ["sd", "perfect", *OWN, *stated.index]
     table = PrintedFrame.from_dict(rows, orient="index", columns=columns)
     table.attrs["known"] = asked.to_dict()
-    table.attrs["mcse"] = errors
-    table["combined"] = np.sqrt(table["sd"] ** 2 + _squares(table).sum(axis=1))
     return table
 
 
-def _stated(fit: FitView) -> xr.Dataset:
-    """The group of shifts; the schema checks its types, and this its labels and uncertainties."""
-    group = fit.result[INPUT_SHIFTS].to_dataset()
-    labels = [group[dim].to_numpy().tolist() for dim in ("statistic", "quantity")]
-    u = group["standard_uncertainty"].to_numpy().astype(float)
-    if (
-        labels[0] != list(STATISTICS)
-        or len({*labels[1]}) < u.size
-        or not (np.isfinite(u) & (u > 0)).all()
-    ):
-        hint = "fit again: labels and standard uncertainties are not as a fit writes them"
-        raise FitError("it states no input quantities", where=INPUT_SHIFTS, hint=hint)
-    return group
+def has_budget(fit: FitView) -> bool:
+    """Whether a fit has intervals and input quantities."""
+    return fit.method != "point" and bool(_errors(fit))
 
 
-def _squares(table: pd.DataFrame) -> pd.DataFrame:
-    """Squares of what the set-up contributes."""
-    # The square of what has an error is too large by that of the error.
-    errors = pd.DataFrame.from_dict(table.attrs["mcse"], orient="index")
-    return (table[list(errors.columns)] ** 2 - errors**2).clip(lower=0.0)
+def _errors(fit: FitView) -> dict[str, Scalar]:
+    """The input quantities, by name."""
+    known = fit.provenance.get("known") or {}
+    usable = (each for each in fit.scalars if (known.get(each.name) or 0.0) > 0.0)
+    return {each.name.removesuffix("_offset"): each for each in usable}
+
+
+def _row(
+    fit: FitView, scalar: Scalar, errors: list[Scalar], stated: pd.Series, asked: pd.Series
+) -> list[float]:
+    """One parameter: its sd, that of a perfect set-up, and what contributes to it."""
+    covariance = np.cov(np.stack([each.draws.ravel() for each in (scalar, *errors)]))
+    if not np.isfinite(covariance).all():
+        return [np.nan] * (4 + len(errors))
+    own, with_errors, of_errors = covariance[0, 0], covariance[0, 1:], covariance[1:, 1:]
+    explained = with_errors @ np.linalg.lstsq(of_errors, with_errors)[0]
+    # Other standard uncertainties change the precision of each prior.
+    change = np.diag(asked.to_numpy() ** -2.0 - stated.to_numpy() ** -2.0)
+    left = np.linalg.lstsq(np.eye(len(errors)) + of_errors @ change, with_errors)[0]
+    variance = own - with_errors @ change @ left
+    parts = left / asked.to_numpy()
+    rest = variance - np.sum(parts**2)
+    noise = _share_of_noise(fit, scalar, {each.name for each in errors})
+    variances = (variance, own - explained, noise * rest, (1.0 - noise) * rest)
+    return [*np.sqrt(np.maximum(variances, 0.0)), *parts]
 
 
 def variance_shares(table: pd.DataFrame) -> pd.DataFrame:
-    """A budget with shares of the combined variance in the place of its parts."""
-    parts = pd.concat([table[list(OWN)] ** 2, _squares(table)], axis=1)
-    return table[["sd", "combined"]].join(parts.div(table["combined"] ** 2, axis=0))
+    """A budget with shares of the variance in the place of its parts."""
+    parts = table.drop(columns=["sd", "perfect"]) ** 2
+    return table[["sd", "perfect"]].join(parts.div(parts.sum(axis=1), axis=0))
 
 
 def _asked(stated: pd.Series, known: Mapping[str, float]) -> pd.Series:
@@ -118,71 +124,64 @@ def _asked(stated: pd.Series, known: Mapping[str, float]) -> pd.Series:
     return pd.Series({**stated.to_dict(), **known}, dtype=float)
 
 
-def _shifts(group: xr.Dataset) -> list[Scalar]:
-    """Of every parameter, the shift by each quantity and its Monte Carlo error, (2, quantity)."""
-    own = group.drop_vars(["standard_uncertainty", "unit", "meaning"])
-    return scalars(own, ("statistic", "quantity"))
-
-
-def _own_parts(fit: FitView, scalar: Scalar, sd: float) -> tuple[float, float]:
-    """The parts of a posterior's sd that come from noise and from the prior."""
+def _share_of_noise(fit: FitView, scalar: Scalar, errors: set[str]) -> float:
+    """Of the variance that no input quantity explains, the share of noise; the rest is prior."""
     # Raising a density to a power a divides its part of the precision by a: the variance then
     # changes at the rate -Cov((x - mean)^2, log density), which is that part of a normal variance.
     square = (scalar.draws - scalar.draws.mean()) ** 2
     rates = []
-    for name in ("log_likelihood", "log_prior"):
-        density = total_density(fit.result, name)
+    for name, without in (("log_likelihood", set()), ("log_prior", errors)):
+        density = total_density(fit.result, name, without)
         if density is None or not np.isfinite(density).all():
-            return np.nan, np.nan
+            return np.nan
         rates.append(max(-float(np.cov(square.ravel(), density.ravel())[0, 1]), 0.0))
-    total = sum(rates)
-    noise = rates[0] / total if total > 0.0 else np.nan
-    return sd * np.sqrt(noise), sd * np.sqrt(1.0 - noise)
+    return rates[0] / sum(rates) if sum(rates) > 0.0 else np.nan
 
 
 class BetterKnown(NamedTuple):
-    """The quantity that contributes most to a parameter, and what knowing it twice as well does."""
+    """The quantity that narrows a parameter most if it is known twice as well, and by how much."""
 
     meaning: str
     known: str
     half: str
-    combined: float
+    sd: float
 
 
 def better_known(fit: FitView, label: str) -> BetterKnown:
     """What to know better for the sake of a parameter."""
-    table, group = budget(fit), fit.result[INPUT_SHIFTS].to_dataset()
-    known = table.attrs["known"]
-    name = str(table.loc[label, list(known)].abs().idxmax())
+    known = budget(fit).attrs["known"]
+    sds = {
+        name: float(budget(fit, known={name: 0.5 * u}).loc[label, "sd"])
+        for name, u in known.items()
+    }
+    name = min(sds, key=sds.__getitem__)
     half = 0.5 * known[name]
-    unit, meaning = (group[key].sel(quantity=name).item() for key in ("unit", "meaning"))
+    _, meaning, unit = notation(_errors(fit)[name].name)
     of_unit = "" if unit == "1" else f" {unit}"
-    combined = float(budget(fit, known={name: half}).loc[label, "combined"])
-    return BetterKnown(meaning, f"{known[name]:g}{of_unit}", f"{half:g}{of_unit}", combined)
+    return BetterKnown(meaning, f"{known[name]:.2g}{of_unit}", f"{half:.2g}{of_unit}", sds[name])
 
 
 @once
 def wider_by_setup(fit: FitView) -> pd.Series:
     """Factors by which the set-up widens uncertainties, the largest first; those worth a word."""
-    if INPUT_SHIFTS not in fit.result.children or fit.method == "point":
+    if not has_budget(fit):
         return pd.Series(dtype=float)
     table = budget(fit)
-    ratio = (table["combined"] / table["sd"]).where(table["sd"] > 0.0)
+    ratio = (table["sd"] / table["perfect"]).where(table["perfect"] > 0.0)
     return ratio[ratio > LIMITS.of_setup].sort_values(ascending=False)
 
 
 @once
 def budget_sentences(fit: FitView) -> tuple[str, ...]:
-    """What the intervals leave out, where that is material; what to know better first."""
+    """What the set-up adds to intervals, where that is material; what to know better first."""
     wider = wider_by_setup(fit)
     if wider.empty:
         return ()
     worst = str(wider.index[0])
-    better, now = better_known(fit, worst), budget(fit).loc[worst, "combined"]
+    better, now = better_known(fit, worst), budget(fit).loc[worst, "sd"]
     factors = join([f"{label} {factor:.2g} times" for label, factor in wider.items()])
     return (
-        "The intervals assume a set-up that is known perfectly. With what it is known to, standard "
-        f"uncertainties are larger: {factors}. Most of that of {worst} comes from the "
-        f"{better.meaning}, known to {better.known}; known to {better.half}, it would leave "
-        f"{better.combined:.2g} instead of {now:.2g}.",
+        "What the set-up is known to makes standard uncertainties larger than those of a perfect "
+        f"one: {factors}. That of {worst} would be {better.sd:.2g} instead of {now:.2g} with the "
+        f"{better.meaning} known to {better.half} instead of {better.known}.",
     )

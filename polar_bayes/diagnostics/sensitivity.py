@@ -12,6 +12,7 @@ Source: Kallioinen et al. (2024), Statistics and Computing 34, 57 (power scaling
 """
 
 import math
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -76,12 +77,14 @@ def _interval(draws: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def total_density(result: xr.DataTree, group: str) -> np.ndarray | None:
-    """The sum of a group of log densities, shape (chain, draw)."""
+def total_density(
+    result: xr.DataTree, group: str, without: Collection[str] = ()
+) -> np.ndarray | None:
+    """The sum of a group of log densities but for some, shape (chain, draw)."""
     if group not in result.children or not result[group].data_vars:
         return None
     total: Any = 0.0
-    for density in result[group].data_vars.values():
+    for density in (x for name, x in result[group].data_vars.items() if name not in without):
         rest = [dim for dim in density.dims if dim not in SAMPLE_DIMS]
         total = total + density.sum(rest, skipna=False).transpose(*SAMPLE_DIMS).to_numpy()
     return np.asarray(total)

@@ -345,6 +345,7 @@ _FIT_PROVENANCE: Mapping[str, Spec] = {
     "method_parts?": TEXT,
     "model_settings?": {EACH: ANY},
     "model_source?": TEXT,
+    "known?": {EACH: POSITIVE},
     "bounds?": {EACH: BOUNDS},
     "declared?": {EACH: ANY},
     "fixed?": {EACH: ANY},
@@ -470,13 +471,6 @@ FIT = Schema(
         ),
         "without_discrepancy": Group(DRAWS, labeled=False),
         "without_instrument": Group(DRAWS, labeled=False),
-        "input_shifts": Group(
-            ("statistic", "quantity"),
-            labeled=False,
-            variables=dict.fromkeys(("quantity", "standard_uncertainty", *_TEXTS), ("quantity",))
-            | {"statistic": ("statistic",)},
-            kinds=dict.fromkeys(("statistic", "quantity", *_TEXTS), TEXTS),
-        ),
         "effects": LEDGER,
         "scenes": SCENES,
         "accuracy": ACCURACY,

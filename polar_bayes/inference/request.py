@@ -10,7 +10,6 @@ import xarray as xr
 from numpyro import distributions as dist
 from numpyro.primitives import Messenger
 
-from polar_bayes.capture.input_quantities import InputQuantities
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.inference.cache_key import cache_key, layout_of
@@ -32,7 +31,14 @@ from polar_bayes.priors import (
     prior_text,
     resolve_priors,
 )
-from polar_bayes.setups import SETUPS, Setup, default_priors, find_setup, setup_name
+from polar_bayes.setups import (
+    SETUPS,
+    Setup,
+    default_priors,
+    find_setup,
+    priors_known_to,
+    setup_name,
+)
 
 MODELS: dict[str, Callable] = {
     "per_material": per_material,
@@ -63,8 +69,6 @@ class Request:
     precision: str
     shared: tuple[str, ...]
     """Parameters of the set-up that the pixels of an image share by default."""
-    known: InputQuantities = ()
-    """What the set-up is known to."""
 
     def bind(self, scene: Scene) -> Callable[[Observations], None]:
         """The model with everything but its data in place."""
@@ -124,8 +128,14 @@ def resolve(
     largest_view_zenith: float | None,
     seed: int,
     precision: str,
+    *,
+    known: Mapping[str, float] | None = None,
+    is_perfect: bool = False,
 ) -> Request:
-    """Check what the caller asked for, and fill in every default."""
+    """Check what the caller asked for, and fill in every default.
+
+    The set-up is known to standard uncertainties, which `known` replaces, or perfectly.
+    """
     capture = validate(capture)
     if {"y", "x"} & set(map(str, capture.dims)):
         raise CaptureError(
@@ -138,6 +148,9 @@ def resolve(
         chosen_by = "capture" if "setup" in capture.attrs else "default"
         scene = str(capture.attrs.get("setup", "paper"))
     setup, scene_name = _find_scene(scene, capture)
+    if not is_perfect:
+        acting = (each for each in setup.known if all(name in capture for name in each.needs))
+        setup = dataclasses.replace(setup, scene=setup.scene.known_to(acting))
     chosen = _choose_links(capture, setup, links)
     limit = setup.largest_view_zenith if largest_view_zenith is None else largest_view_zenith
     if not 0.0 < limit <= 90.0:
@@ -154,6 +167,10 @@ def resolve(
     own: dict[str, dist.Distribution] = {}
     if isinstance(stated, Mapping):  # anything else is refused where the priors are read
         usual = default_priors(setup, capture)
+        every = {**PRIORS, **usual}
+        usual |= priors_known_to(
+            known, capture, {n: every[n] for n in setup.scene.parameters if n in every}
+        )
         same = {n: x for n, x in {**PRIORS, **usual}.items() if _are_same(stated.get(n), x)}
         own = {name: prior for name, prior in stated.items() if name not in same}
         stated = {**usual, **own, **same}
@@ -187,7 +204,6 @@ def resolve(
         seed=int(seed),
         precision=precision,
         shared=tuple(name for name in setup.shared if name in found.priors),
-        known=tuple(each.as_stated(capture) for each in setup.known if each.acts_on(capture)),
     )
 
 

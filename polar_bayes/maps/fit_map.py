@@ -214,7 +214,8 @@ def plan_map(
         hint = "give an image with dims y and x, or use polar_bayes.fit"
         raise CaptureError(what, where=str(capture.attrs.get("name", "capture")), hint=hint)
     pixel, limit = _fullest_pixel(capture), largest_view_zenith
-    request = resolve(pixel, model, scene, priors, links, limit, seed, precision)
+    asked = pixel, model, scene, priors, links, limit, seed, precision
+    request = resolve(*asked, is_perfect=True)  # pixels have no input quantities of their own
     known = (name for name in (*ANGLES, "normal_confidence") if name in capture)
     own = frozenset(name for name in known if set(IMAGE) & set(capture[name].dims))
     unit = _intensity_unit(capture)

@@ -1,3 +1,4 @@
+from . import input_quantities as input_quantities
 from . import instrument as instrument
 from .coat import (
     AbstractCoat as AbstractCoat,

@@ -1,7 +1,7 @@
 """A scene: the optics and the instrument that turn material parameters into predicted readings."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import ClassVar, override
 
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ from polar_bayes.physics.dispersion import AbstractDispersion
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import PointSource
+from polar_bayes.physics.input_quantities import AbstractInputQuantity
 from polar_bayes.physics.instrument import (
     AbstractInstrumentTerm,
     AngleZero,
@@ -203,7 +204,30 @@ class Scene(HTMLRepr):
             present = ", ".join(type(part).__name__ for part in terms) or "none"
             hint = f"name one of its instrument terms: {present}"
             raise SceneError(f"the scene has no {term.__name__}", where="without", hint=hint)
-        return dataclasses.replace(self, instrument=Instrument(rest) if rest else None)
+        return self._with_terms(rest)
+
+    def known_to(self, quantities: Iterable[AbstractInputQuantity]) -> "Scene":
+        """The same scene with these input quantities of its set-up, but for those it has.
+
+        Args:
+            quantities: What the set-up is known to, such as `LightZenith()`.
+
+        Returns:
+            A new scene; the quantities follow the other terms of its instrument.
+        """
+        terms = () if self.instrument is None else self.instrument.terms
+        own = {type(term) for term in terms}
+        terms = (*terms, *(each for each in quantities if type(each) not in own))
+        return self._with_terms(terms)
+
+    @property
+    def perfectly_known(self) -> "Scene":
+        """The same scene without input quantities."""
+        terms = () if self.instrument is None else self.instrument.terms
+        return self._with_terms(tuple(x for x in terms if not isinstance(x, AbstractInputQuantity)))
+
+    def _with_terms(self, terms: tuple[AbstractInstrumentTerm, ...]) -> "Scene":
+        return dataclasses.replace(self, instrument=Instrument(terms) if terms else None)
 
     def _optics(self, parameters: Parameters, geometry: Geometry) -> Light:
         """Light in the stated frame of the viewer, for parameters that have a view axis."""
@@ -228,6 +252,11 @@ class Scene(HTMLRepr):
         mixture = self.mixing.mix(parameters["subsurface_fraction"], surface, subsurface)
         return Light(*jnp.broadcast_arrays(*mixture))
 
+    def _neutral_quantities(self) -> dict[str, float]:
+        terms = () if self.instrument is None else self.instrument.terms
+        known = (term for term in terms if isinstance(term, AbstractInputQuantity))
+        return {name: value for term in known for name, value in term.neutral.items()}
+
     def _wavelength(self, geometry: Geometry) -> Array:
         if geometry.wavelength is None:
             what = "a law of dispersion needs a wavelength, and there is none"
@@ -241,6 +270,8 @@ class Scene(HTMLRepr):
         """The parameters that the scene reads, in one precision, each with a trailing view axis."""
         # A Python number takes the precision of the arrays beside it.
         needed = [name for name in self.parameters if name in names]
+        # Who does not know of an input quantity, such as a model of the user's own, has none.
+        parameters = {**self._neutral_quantities(), **parameters}
         missing = [name for name in needed if name not in parameters]
         if missing:
             hint = f"this scene reads {', '.join(needed)}"

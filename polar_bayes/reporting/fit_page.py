@@ -14,9 +14,9 @@ from polar_bayes.benchmark.advice import accuracy_sentences, accuracy_view
 from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.alternatives import alternatives
 from polar_bayes.diagnostics.budget import (
-    INPUT_SHIFTS,
     budget,
     budget_sentences,
+    has_budget,
     variance_shares,
 )
 from polar_bayes.diagnostics.compare import WITHOUT, compare_without
@@ -32,6 +32,7 @@ from polar_bayes.inference.checks import CAUTION, PROBLEM
 from polar_bayes.inference.files import sentences_of_auto
 from polar_bayes.methods.registry import METHODS
 from polar_bayes.numerics.psis import MAX_PARETO_K
+from polar_bayes.physics.part import notation
 from polar_bayes.priors import short_numbers
 from polar_bayes.reporting import page, plots_curves, plots_fit, text
 from polar_bayes.reporting.accuracy import accuracy_picture, study_table
@@ -408,25 +409,25 @@ def discrepancy_table(fit: FitView, compared: pd.DataFrame, part: str, name: str
 
 def _setup(fit: FitView) -> Iterator[page.Block]:
     """Where the uncertainty of the material comes from, as far as the set-up states it."""
-    if INPUT_SHIFTS not in fit.result.children or fit.method == "point":
-        return
-    yield budget_table(fit)
-    yield from budget_sentences(fit)
+    if has_budget(fit):
+        yield budget_table(fit)
+        yield from budget_sentences(fit)
 
 
 def budget_table(fit: FitView) -> Table:
-    """Where the combined variance of each parameter of the material comes from."""
-    found, stated = budget(fit), fit.result[INPUT_SHIFTS].to_dataset()
+    """Where the variance of each parameter of the material comes from."""
+    found = budget(fit)
     data = variance_shares(found).T
-    descriptions = {"sd": "of the posterior", "combined": "with the set-up"}
-    descriptions |= {"noise": "of the readings", "prior": "of the parameters"}
-    for name, u in found.attrs["known"].items():
-        unit, meaning = (stated[key].sel(quantity=name).item() for key in ("unit", "meaning"))
-        descriptions[name] = f"{meaning}, ± {u:g}{'' if unit == '1' else f' {unit}'}"
+    descriptions = {"sd": "of the posterior", "perfect": "in a set-up that is known perfectly"}
+    descriptions |= {"noise": "of the readings", "prior": "of the other parameters"}
+    for quantity, u in found.attrs["known"].items():
+        offset = quantity if quantity in fit.provenance["known"] else f"{quantity}_offset"
+        _, meaning, unit = notation(offset)
+        descriptions[quantity] = f"{meaning}, ± {u:.2g}{'' if unit == '1' else f' {unit}'}"
 
     def cell(label: str) -> Callable[[pd.Series], str]:
         def of_row(row: pd.Series) -> str:
-            is_share = row.name not in ("sd", "combined")
+            is_share = row.name not in ("sd", "perfect")
             return percent(row[label]) if is_share else number(row[label], row[label])
 
         return of_row

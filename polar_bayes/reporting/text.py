@@ -335,24 +335,15 @@ def next_sentence(result: xr.DataTree) -> str:
 
 
 def setup_beside_views(fit: FitView) -> list[str]:
-    """What further views do for n, and what knowing the set-up better does, where it matters."""
+    """What knowing the set-up better does for n, beside further views, where it matters."""
     wider = wider_by_setup(fit).filter(like="refractive_index")
     if "next_views" not in fit.result.children or wider.empty:
         return []
     label = str(wider.index[0])
-    table, better = budget(fit), better_known(fit, label)
-    width = fit.result["next_views"]["interval_width"].transpose("step", "parameter").to_pandas()
-    if label not in width:
-        return []
-    sd, combined = table.loc[label, ["sd", "combined"]]
-    now, views, setup = (
-        math.hypot(width[label].iloc[step], 2.0 * 1.96 * math.sqrt(whole**2 - sd**2))
-        for step, whole in ((0, combined), (-1, combined), (0, better.combined))
-    )
+    better, now = better_known(fit, label), budget(fit).loc[label, "sd"]
     return [
-        f"With what the set-up is known to, these views narrow the 95% interval of {label} by "
-        f"{1.0 - views / now:.0%}; the {better.meaning} known to {better.half} instead of "
-        f"{better.known} narrows it by {1.0 - setup / now:.0%}."
+        f"Without further views, the {better.meaning} known to {better.half} instead of "
+        f"{better.known} narrows the 95% interval of {label} by {1.0 - better.sd / now:.0%}."
     ]
 
 

@@ -194,6 +194,7 @@ class FitArguments:
     largest_view_zenith: float | None
     seed: int
     precision: str
+    known: Mapping[str, float] | None = None
     scene_parameters: frozenset[str] = frozenset()
     """Parameters that any of the scenes reads."""
 
@@ -233,6 +234,7 @@ class FitArguments:
             self.largest_view_zenith,
             self.seed,
             self.precision,
+            known=self.known,
         )
 
 

@@ -21,7 +21,6 @@ from polar_bayes import methods
 from polar_bayes.capture.plausibility import cautions, indices_by_eye
 from polar_bayes.capture.schema import count
 from polar_bayes.errors import FitError
-from polar_bayes.inference.input_sensitivity import mean_shifts
 from polar_bayes.inference.prior_probability import has_probabilities, probability_below
 from polar_bayes.inference.problem import Problem, make_problem
 from polar_bayes.inference.program import BLOCK, THREADS, Values, from_prior
@@ -29,6 +28,8 @@ from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import Provenance, assemble
 from polar_bayes.methods.method import AbstractMethod, find_method
 from polar_bayes.numerics.compile import check_memory, compiled
+from polar_bayes.physics.instrument import Discrepancy
+from polar_bayes.physics.part import parameters_of
 from polar_bayes.priors import support_bounds
 from polar_bayes.progress import Progress
 from polar_bayes.scenes.neighbors import STOPPED, fit_comparisons, removed_terms, try_alternatives
@@ -71,8 +72,6 @@ def fit_request(
     checked = method.cross_check(problem, posterior.parameters, key_check)
     timings.record("cross-check")
     is_point = draws.covariance is not None
-    shifts = None if is_point else mean_shifts(request, problem, draws.z, posterior)
-    timings.record("budget")
 
     stated = {name: getattr(draws, name) for name in DIAGNOSTICS}
     known = {
@@ -93,7 +92,6 @@ def fit_request(
         provenance |= {"comparisons_failed": failed} if failed else {}
         ledger = request.scene.ledger  # how the scene was chosen
         tables = {"effects": ledger} if isinstance(ledger, xr.Dataset) else {}
-        tables |= {} if shifts is None else {"input_shifts": shifts}
         return assemble(
             problem.program,
             request.capture,
@@ -209,6 +207,16 @@ def _prior_probability(request: Request, posterior: Values) -> dict[str, list[fl
     return found
 
 
+def _known(request: Request, problem: Problem) -> dict[str, float]:
+    """Standard deviations of the priors of the instrument's parameters that are one number."""
+    instrument = request.scene.instrument
+    terms = () if instrument is None else instrument.terms
+    names = parameters_of(*(each for each in terms if not isinstance(each, Discrepancy)))
+    priors = {name: request.priors[name] for name in names if name in problem.program.supports}
+    variances = {name: float(np.sum(prior.variance)) for name, prior in priors.items()}
+    return {name: math.sqrt(x) for name, x in variances.items() if 0.0 < x < math.inf}
+
+
 def _indices_by_eye(request: Request) -> dict[str, list[float]]:
     """Index by eye of each material; none where a coat or polarized light moves the peak."""
     source = getattr(request.scene.surface, "illumination", None)
@@ -236,6 +244,7 @@ def _provenance(request: Request, method: AbstractMethod, problem: Problem) -> P
         "model_source": _model_source(request.model),
         "capture_cautions": list(cautions(request.capture)),
         "indices_by_eye": _indices_by_eye(request),
+        "known": _known(request, problem),
         "bounds": {name: _finite_bounds(prior) for name, prior in request.priors.items()},
         "declared": request.declared,
         "fixed": request.fixed,

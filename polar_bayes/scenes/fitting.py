@@ -28,6 +28,7 @@ def fit(
     scene: str | Scene | None = None,
     priors: Mapping[str, dist.Distribution] | None = None,
     links: AbstractLink | Mapping[str, AbstractLink] | None = None,
+    known: Mapping[str, float] | None = None,
     largest_view_zenith: float | None = None,
     seed: int = 0,
     precision: str = "double",
@@ -54,6 +55,9 @@ def fit(
             convergence serve as they are; the other scenes are sampled.
         priors: Distributions that replace or extend `polar_bayes.priors.PRIORS`.
         links: One link for the polarization, or a mapping from variable to link.
+        known: Standard uncertainties of what the set-up is known to, above 0, by input quantity,
+            such as `{"light_zenith": 0.2}` (degree); they replace those of the set-up. A capture
+            may state the same in its attributes, such as `light_zenith_uncertainty`.
         largest_view_zenith: Views beyond it are set aside and counted. Unit degree.
         seed: The same seed gives the same result on the same machine, unless "auto" ran out of
             time.
@@ -79,9 +83,10 @@ def fit(
     chosen, show = choose_method(method, tolerance, seconds), progress or no_progress
     if isinstance(scene, str) and scene == "auto":
         arguments = polar_bayes.scenes.stacking.FitArguments(
-            validate(capture), model, priors, links, largest_view_zenith, seed, precision
+            validate(capture), model, priors, links, largest_view_zenith, seed, precision, known
         )
         return polar_bayes.scenes.stacking.fit_best_scenes(arguments, chosen, show, keep)
-    request = resolve(capture, model, scene, priors, links, largest_view_zenith, seed, precision)
+    limit = largest_view_zenith
+    request = resolve(capture, model, scene, priors, links, limit, seed, precision, known=known)
     with jax.enable_x64(precision == "double"):
         return fit_request(request, chosen, show, start_time, keep=keep)

@@ -39,7 +39,7 @@ from polar_bayes.methods.method import AbstractBatchMethod
 from polar_bayes.observation import links
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.paths import SCENE_KEYS, atomic_write, existing_file, is_scene_file
-from polar_bayes.physics import instrument
+from polar_bayes.physics import input_quantities, instrument
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import parse_prior
 from polar_bayes.setups import SETUPS, Setup, find_setup
@@ -70,7 +70,9 @@ def parse_method(text: str, where: str) -> str | AbstractBatchMethod:
 
 def parse_scene(text: object, where: str) -> Scene:
     """The scene that a text such as `Scene(surface=SmoothSurface())` describes."""
-    found = parse_value(text, _known(polar_bayes.physics, instrument), where, SceneError)
+    found = parse_value(
+        text, _known(polar_bayes.physics, instrument, input_quantities), where, SceneError
+    )
     if not isinstance(found, Scene):
         hint = "give one such as Scene(surface=SmoothSurface())"
         raise SceneError(f"{text!r} is no scene", where=where, hint=hint)
@@ -152,7 +154,7 @@ def _scene_of(stated: Mapping[str, Any], where: str) -> str | Scene | Setup | No
     if "surface" not in texts:
         hint = "list every part of the scene, such as surface = 'SmoothSurface()'"
         raise SceneError("it has no surface", where=f"{where}: scene", hint=hint)
-    known = _known(polar_bayes.physics, instrument)
+    known = _known(polar_bayes.physics, instrument, input_quantities)
     parts = {
         name: parse_value(text, known, f"{where}: scene.{name}", SceneError)
         for name, text in texts.items()
@@ -160,6 +162,7 @@ def _scene_of(stated: Mapping[str, Any], where: str) -> str | Scene | Setup | No
     scene = Scene(**parts)
     if setup is None:
         return scene
+    scene = scene.perfectly_known if scene.perfectly_known == setup.scene else scene
     return base if scene == setup.scene else dataclasses.replace(setup, scene=scene)
 
 

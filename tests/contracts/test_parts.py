@@ -40,7 +40,7 @@ SETTINGS: dict[type, tuple] = {
 def every_part() -> dict[str, Any]:
     """A value of every part that a user can put into a scene."""
     found = {}
-    for namespace in (pb.physics, pb.instrument):
+    for namespace in (pb.physics, pb.instrument, pb.input_quantities):
         for name in namespace.__all__:
             part = getattr(namespace, name)
             concrete = inspect.isclass(part) and not inspect.isabstract(part)
@@ -56,7 +56,8 @@ PARTS = every_part()
 def test_every_part_is_a_frozen_value_that_its_repr_makes_again(part: Part) -> None:
     assert dataclasses.replace(part) == part
     assert hash(dataclasses.replace(part)) == hash(part)
-    assert eval(repr(part), vars(pb.physics) | vars(pb.instrument)) == part
+    names = vars(pb.physics) | vars(pb.instrument) | vars(pb.input_quantities)
+    assert eval(repr(part), names) == part
     for field in dataclasses.fields(part):
         with pytest.raises(dataclasses.FrozenInstanceError):
             setattr(part, field.name, None)
