@@ -36,7 +36,7 @@ from polar_bayes.physics.instrument import (
 )
 from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import Scene
-from polar_bayes.priors import RANGES
+from polar_bayes.priors import PRIORS, RANGES
 from polar_bayes.setups import SETUPS, Setup, find_setup, setup_name
 
 __all__ = ["PRESETS", "Material", "Protocol"]
