@@ -75,6 +75,20 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
         "paper": Setup(
             SCENES["paper"], {"dop": BetaLink(), "intensity": StudentTLink()}, priors=MAYBE_BARE
         ),
+        # Measured degrees of polarization: the paper's optics, and a set-up known to what is usual.
+        "polarimeter": Setup(
+            SCENES["polarimeter"],
+            {"dop": BetaLink(), "intensity": StudentTLink()},
+            priors=MAYBE_BARE,
+            known=(
+                LightZenith(),
+                LightAzimuth(),
+                ViewZenithScale(),
+                PolarizationGain(),
+                AmbientLight(),
+                ToneCurve(),
+            ),
+        ),
         "camera": Setup(
             SCENES["camera"],
             {"q": StokesLink(), "u": StokesLink(), "intensity": StudentTLink()},
@@ -123,7 +137,10 @@ def find_setup(name: str | Setup) -> Setup:
 def setup_name(setup: Setup) -> str:
     """The name of the set-up that has this scene, or "custom"."""
     scene = setup.scene.perfectly_known
-    return next((name for name, own in SETUPS.items() if own.scene == scene), "custom")
+    names = [name for name, own in SETUPS.items() if own.scene == scene]
+    return next(
+        (name for name in names if SETUPS[name].known == setup.known), (*names, "custom")[0]
+    )
 
 
 def default_priors(setup: Setup, capture: xr.Dataset) -> dict[str, dist.Distribution]:

@@ -44,9 +44,8 @@ def test_the_table_cannot_be_changed_by_accident():
 def test_an_unknown_name_is_answered_with_the_known_ones(name):
     with pytest.raises(SceneError) as caught:
         find_setup(name)
-    expected = (
-        "no such scene; give one of paper, camera, picture, goniometer, or a polar_bayes.Scene"
-    )
+    names = "paper, polarimeter, camera, picture, goniometer"
+    expected = f"no such scene; give one of {names}, or a polar_bayes.Scene"
     assert str(caught.value) == f"scene={name!r}: {expected}"
 
 

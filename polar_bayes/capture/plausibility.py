@@ -181,8 +181,8 @@ def stated(capture: xr.Dataset) -> tuple[str, ...]:
         A sentence on the set-up, and one on the incident levels of a goniometer.
     """
     setup = (
-        "Set-up: not stated, so a fit takes 'paper', a point source and an unsigned degree of "
-        "polarization; name it by setup= at import or scene= of the fit."
+        "Set-up: not stated, so a fit takes 'polarimeter', a point source and an unsigned degree "
+        "of polarization; name it by setup= at import or scene= of the fit."
     )
     if "setup" in capture.attrs:
         setup = f"Set-up: {capture.attrs['setup']}, which its fits take by default."

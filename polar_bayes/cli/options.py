@@ -150,7 +150,7 @@ class Output(click.ParamType):
 INPUT, COLUMN_OR_INPUT = Input(), Input(is_path=False)
 CAPTURE_FILE, RESULT_FILE, FOLDER, STORE = Output("capture"), Output("result"), Output(), Output()
 SCENE_FILE = Output("scene")
-SETUP_NAMES = ("paper", "camera", "picture", "goniometer")
+SETUP_NAMES = ("paper", "polarimeter", "camera", "picture", "goniometer")
 SCENE = NamedInput(SETUP_NAMES, ".toml", "a scene file (.toml)")
 FIT_SCENE = NamedInput((*SETUP_NAMES, "auto"), ".toml", "a scene file (.toml)")
 SCENE_SOURCE = NamedInput(SETUP_NAMES, ".nc", "a result")

@@ -56,7 +56,7 @@ def from_table(
             be several: the angle of a mirror is that of view and light.
         constants: Variables that are the same everywhere: `{"light_zenith": 45.0}`.
         ignored: Columns to leave out.
-        setup: Which scene, links and limits a fit takes by default; None: the paper's.
+        setup: Which scene, links and limits a fit takes by default; None: those of "polarimeter".
         angle_set_by: How the angles were set: "stage", "hand" or "lens"; a fit takes the prior of
             `angle_zero` from it (`polar_bayes.priors.ANGLE_ZERO`).
         saturation_level: Intensity, > 0, at which the detector saturates.

@@ -146,7 +146,7 @@ def resolve(
     chosen_by = "caller"
     if scene is None:
         chosen_by = "capture" if "setup" in capture.attrs else "default"
-        scene = str(capture.attrs.get("setup", "paper"))
+        scene = str(capture.attrs.get("setup", "polarimeter"))
     setup, scene_name = _find_scene(scene, capture)
     if not is_perfect:
         acting = (each for each in setup.known if all(name in capture for name in each.needs))

@@ -290,13 +290,16 @@ WAY_OUT = FacetQuadrature(along=5, across=4)
 # Eighty facets, where the number of facets itself is to be judged.
 MANY_FACETS = FacetQuadrature(along=10, across=8)
 
+_PAPER = Scene(
+    surface=RoughSurface(Beckmann(), PointSource(), WAY_OUT),
+    subsurface=Depolarizer(),
+    mixing=DopMixing(),
+)
+
 SCENES: dict[str, Scene] = {
     # Equation 1 as printed: unsigned degrees of polarization, one fraction for all views.
-    "paper": Scene(
-        surface=RoughSurface(Beckmann(), PointSource(), WAY_OUT),
-        subsurface=Depolarizer(),
-        mixing=DopMixing(),
-    ),
+    "paper": _PAPER,
+    "polarimeter": _PAPER,
     # A camera with a polarizer: Stokes vectors add; its extinction ratio is finite.
     "camera": Scene(
         surface=RoughSurface(Beckmann(), PointSource(), WAY_OUT),
@@ -322,8 +325,11 @@ _FULL_SURFACE = RoughSurface(
 )
 
 FULL_SCENES: dict[str, Scene] = {
-    "paper": dataclasses.replace(
-        SCENES["paper"], surface=_FULL_SURFACE, instrument=Instrument((AngleZero(), DarkLevel()))
+    **dict.fromkeys(
+        ("paper", "polarimeter"),
+        dataclasses.replace(
+            _PAPER, surface=_FULL_SURFACE, instrument=Instrument((AngleZero(), DarkLevel()))
+        ),
     ),
     "camera": dataclasses.replace(
         SCENES["camera"],

@@ -255,7 +255,7 @@ def test_the_capture_is_not_changed(capture: xr.Dataset) -> None:
         ),
         (
             {"scene": "moon"},
-            r"scene='moon': no such scene; give one of paper, camera, picture, goniometer",
+            r"scene='moon': no such scene; give one of paper, polarimeter, camera, picture, gonio",
         ),
         ({"scene": 3}, r"a int is not a scene"),
         ({"links": pb.links.BetaLink()}, r"no polarization that these links describe"),
