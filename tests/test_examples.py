@@ -93,7 +93,7 @@ def rehearse(capture: xr.Dataset, asked: dict[str, object]) -> None:
     options = inspect.signature(fit).bind(capture, **asked)
     options.apply_defaults()
     wanted = list(inspect.signature(resolve).parameters)
-    request = resolve(*(options.arguments[name] for name in wanted))
+    request = resolve(**{n: options.arguments[n] for n in wanted if n in options.arguments})
     data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
     program = compile_program(request.bind(request.scene), data)
     assert jax.eval_shape(program.potential, np.zeros(program.size), data).shape == ()

@@ -153,15 +153,8 @@ def resolve(
         setup = dataclasses.replace(setup, scene=setup.scene.known_to(acting))
     chosen = _choose_links(capture, setup, links)
     limit = setup.largest_view_zenith if largest_view_zenith is None else largest_view_zenith
-    if not 0.0 < limit <= 90.0:
-        raise FitError(
-            f"largest_view_zenith is {limit}", where="fit", hint="give degrees from 0 to 90"
-        )
+    _check_settings(limit, precision, seed)
     _check_views(capture, limit)
-    if precision not in ("double", "single"):
-        raise FitError(f"precision is {precision!r}", where="fit", hint="give 'double' or 'single'")
-    if not isinstance(seed, Integral) or isinstance(seed, bool) or not 0 <= seed < 2**32:
-        raise FitError(f"seed is {seed!r}", where="fit", hint="give an integer from 0 to 2**32 - 1")
     function = model if callable(model) else _find_model(model)
     stated = {} if priors is None else priors
     own: dict[str, dist.Distribution] = {}
@@ -205,6 +198,18 @@ def resolve(
         precision=precision,
         shared=tuple(name for name in setup.shared if name in found.priors),
     )
+
+
+def _check_settings(limit: float, precision: str, seed: int) -> None:
+    what, hint = "", ""
+    if not 0.0 < limit <= 90.0:
+        what, hint = f"largest_view_zenith is {limit}", "give degrees from 0 to 90"
+    elif precision not in ("double", "single"):
+        what, hint = f"precision is {precision!r}", "give 'double' or 'single'"
+    elif not isinstance(seed, Integral) or isinstance(seed, bool) or not 0 <= seed < 2**32:
+        what, hint = f"seed is {seed!r}", "give an integer from 0 to 2**32 - 1"
+    if what:
+        raise FitError(what, where="fit", hint=hint)
 
 
 def _find_scene(scene: object, capture: xr.Dataset) -> tuple[Setup, str]:
