@@ -37,7 +37,8 @@ FUNCTIONS = {
 KEYWORDS = {
     **{name: f"--{name}" for name in ("angle", "dim", "drop", "keep", "method", "model", "p")},
     **{name: f"--{name}" for name in ("precision", "preset", "s", "scene", "scheduler", "seed")},
-    **{name: f"--{name}" for name in ("setup", "table", "transfer", "truth")},
+    **{name: f"--{name}" for name in ("setup", "sheet", "table", "transfer", "truth")},
+    "angle_is": "--angle-is",
     "links": "--link",
     "parameter": "--profile",
     "priors": "--prior",
