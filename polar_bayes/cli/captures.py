@@ -170,6 +170,49 @@ def goniometer(out: Path, **settings: Any) -> None:
 
 
 @import_.command(cls=Command)
+@option("--table", type=INPUT, required=True, help="Text, .xlsx, or a .dat file of WVASE.")
+@option("--angle", help="Column with the angle, or the angle of all lines in degrees.")
+@angle_is_option
+@option("--psi", multiple=True, help="Column of psi; give it once for each wavelength.")
+@option("--delta", multiple=True, help="Column of delta, for u as well; once for each wavelength.")
+@option(
+    "--mueller",
+    help="In place of --psi, elements m00... or m11...: column (the light was unpolarized) or row "
+    "(the detector was blind to polarization).",
+)  # fmt: skip
+@option(
+    "--wavelength", multiple=True,
+    help="Column of wavelengths, or nanometers: of all lines, or once for each --psi.",
+)  # fmt: skip
+@option("--unit", help="Of psi and delta: degree or radian.  [default: degree]")
+@option("--psi-error", help="Error of psi, or its column.  [default: 0.1 degrees]")
+@option("--delta-error", help="Error of delta, or its column.  [default: 0.2 degrees]")
+@sheet_option
+@option("--angle-set-by", default="stage", help="stage, hand or lens.")
+@name_option
+@out_capture
+def ellipsometer(table: Path, out: Path, wavelength: tuple[str, ...], **settings: Any) -> None:
+    """Import psi and delta, or Mueller elements, against the angle.
+
+    Without --psi and --mueller the table is a .dat file of WVASE, whose lines of other kinds than
+    E are left out and counted. A plate with a polished back sends back light of its back face too.
+    """
+    for key in ("angle", "psi_error", "delta_error"):
+        settings[key] = _number_or_column(settings[key])
+    waves = [_number_or_column(each) for each in wavelength]
+    settings["wavelength"] = waves if len(waves) > 1 else next(iter(waves), None)
+    _save_import(pb.from_ellipsometer(table, **settings), out)
+
+
+def _number_or_column(text: str | None) -> float | str | None:
+    """A number, or the name of a column."""
+    try:
+        return None if text is None else float(text)
+    except ValueError:
+        return text
+
+
+@import_.command(cls=Command)
 @click.argument("table", type=INPUT)
 @option(
     "--column", "columns", type=(str, str), multiple=True, metavar="VARIABLE COLUMN",

@@ -39,6 +39,11 @@ KEYWORDS = {
     **{name: f"--{name}" for name in ("precision", "preset", "s", "scene", "scheduler", "seed")},
     **{name: f"--{name}" for name in ("setup", "sheet", "table", "transfer", "truth")},
     "angle_is": "--angle-is",
+    "delta": "--delta",
+    "mueller": "--mueller",
+    "psi": "--psi",
+    "unit": "--unit",
+    "wavelength": "--wavelength",
     "links": "--link",
     "parameter": "--profile",
     "priors": "--prior",
@@ -54,6 +59,8 @@ KEYWORD, FUNCTION = ("|".join(map(re.escape, names)) for names in (KEYWORDS, FUN
 
 RULES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     # What a command cannot do is left to Python, or left out.
+    (r"pb\.from_ellipsometer\(mueller='column'\)",
+     "polar-bayes import ellipsometer --mueller column"),
     (r"goes with pb\.fit only", "is fitted in Python only"),
     (r"fit with load_scene and model= in Python", "fit it in Python"),
     (r"polar_bayes\.save or (?=a command)", ""),

@@ -86,6 +86,7 @@ class Table:
         errors: The uncertainty that a cell states behind its reading, NaN where it states none.
         lines: Number of each line in the file.
         notes: What was read other than as a plain number, or left out, each with its count.
+        above: The cells above the first reading, names of columns included.
     """
 
     source: str
@@ -94,6 +95,7 @@ class Table:
     errors: Mapping[str, np.ndarray]
     lines: tuple[int, ...]
     notes: tuple[str, ...] = ()
+    above: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -107,6 +109,7 @@ def read_table(
     *,
     sheet: str | None = None,
     wanted: Sequence[str] = (),
+    kind: str | None = None,
 ) -> Table:
     """Columns of a text table or of a sheet.
 
@@ -116,6 +119,7 @@ def read_table(
         columns: The columns that are read, or a function that gives them from the names of all; by
             default all. A line whose first one is blank, or names a statistic, holds no reading.
         sheet: Name of a sheet of a workbook, where several hold something.
+        kind: Lines begin with a word, and those of another word are left out.
         wanted: Names by which the line of names is found below other text; by default `columns`.
 
     Raises:
@@ -133,6 +137,7 @@ def read_table(
     if all(line.is_comment for line in found.lines):
         raise CaptureError("it holds no rows", where=found.source, hint=EACH_READING)
     wanted = wanted or (() if callable(columns) else columns)
+    found, others = _of_kind(found, kind)
     names, rows, left_out = _below_names(found.lines, wanted, found.source)
     chosen = list((columns(names) if callable(columns) else columns) or names)
     for column in chosen:
@@ -141,7 +146,9 @@ def read_table(
         raise CaptureError("it holds names but no rows", where=found.source, hint=EACH_READING)
     rows, more = _with_readings(rows, names, chosen[0], found.source)
     cells = {name: [line.cells[names.index(name)] for line in rows] for name in chosen}
-    return _as_numbers(found, cells, rows, (*found.notes, *left_out, *more))
+    above = [cell for line in found.lines if line < rows[0] for cell in line.cells]
+    read = _as_numbers(found, cells, rows, (*found.notes, *others, *left_out, *more))
+    return dataclasses.replace(read, above=tuple(above))
 
 
 def check_column(column: str, names: Sequence[str], source: str) -> None:
@@ -282,6 +289,24 @@ def _text_of(value: object) -> str:
     if value is None:
         return ""
     return f"{value:.15g}" if isinstance(value, float) else str(value).strip()
+
+
+def _of_kind(found: Cells, kind: str | None) -> tuple[Cells, list[str]]:
+    """The lines of one kind without that word, lines without numbers, and what is left out."""
+    if not any(line.cells[0] == kind for line in found.lines):
+        return found, []
+    lines: list[Line] = []
+    others: dict[str, list[Line]] = {}
+    for line in found.lines:
+        numbers = len(line.cells) > 2 and all(map(_is_blank_or_number, line.cells[1:]))
+        if not numbers or not _is_name(line.cells[0]):
+            lines.append(line)
+        elif line.cells[0] == kind:
+            lines.append(line._replace(cells=line.cells[1:]))
+        else:
+            others.setdefault(line.cells[0], []).append(line)
+    notes = [note for word, left in others.items() for note in _left_out(left, f"of kind {word}")]
+    return found._replace(lines=lines), notes
 
 
 # --- Names of the columns, and lines that hold no reading -----------------------------------------

@@ -6,7 +6,7 @@ for p light. With S and P the readings less the dark level, over the incident le
     q = (S - P) / (S + P),    dop = |q|,    intensity = (S + P) / 2,
 
 one view for each angle at which either channel was read. Of one channel alone (s, p, or
-unpolarized light) there is the intensity, and the attribute `channel` says whose it is.
+unpolarized light) there is the intensity, and its attribute `channel` says whose it is.
 
 Errors: a reading R has the standard deviation sqrt((relative_error R)^2 + e^2), where e is the
 error given for its channel, or else the resolution of the printed number (last digit / sqrt(12)). A
@@ -240,10 +240,9 @@ def _alone(channel: "Channel", units: str) -> xr.Dataset:
     return xr.Dataset(
         {
             **mirror_views(channel.angle),
-            "intensity": ("view", light, {"units": units}),
+            "intensity": ("view", light, {"units": units, "channel": channel.name}),
             "intensity_error": ("view", error, {"units": units}),
         },
-        attrs={"channel": channel.name},
     )
 
 

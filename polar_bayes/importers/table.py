@@ -153,9 +153,7 @@ def _columns(
         _check_name(variable, f"{source}: column {column}")
     used = dict(columns)
     if any(MUELLER.fullmatch(name) for name in names if name not in (*columns.values(), *ignored)):
-        hint = (
-            "import it by from_ellipsometer(table, angle=, mueller='column'), which takes q and u"
-        )
+        hint = "import it by pb.from_ellipsometer(mueller='column') if the light was unpolarized"
         raise CaptureError("it holds elements of Mueller matrices", where=source, hint=hint)
     for column in (name for name in names if name not in (*columns.values(), *ignored)):
         where = f"{source}: column {column}"
@@ -271,16 +269,19 @@ def _of_materials(
         labels = values.pop(leading[0])
         parts = {
             # All digits: two numbers never have one label. Adding zero turns -0.0 into 0.0.
-            repr(float(label) + 0.0).removesuffix(".0"): _capture(
+            repr(float(label) + 0.0).removesuffix(".0"): capture_of_lines(
                 {name: x[labels == label] for name, x in values.items()}, saturation_level
             )
             for label in np.unique(labels)
         }
         return combine(parts, dim=leading[0])
-    return _capture(values, saturation_level)
+    return capture_of_lines(values, saturation_level)
 
 
-def _capture(values: dict[str, np.ndarray], saturation_level: float | None) -> xr.Dataset:
+def capture_of_lines(
+    values: dict[str, np.ndarray], saturation_level: float | None = None
+) -> xr.Dataset:
+    """The capture of lines of one material; those of several wavelengths are views by direction."""
     values = dict(values)
     waves = values.pop("wavelength", None)
     if waves is None or len(np.unique(waves)) == 1:
