@@ -320,9 +320,14 @@ def polarizer(frames: tuple[tuple[float, Path], ...], out: Path, **options: Any)
     "--layout", type=float, nargs=4, default=(90.0, 45.0, 135.0, 0.0),
     help="Angles of the four pixels, row by row [degrees].",
 )  # fmt: skip
-@option("--bin", type=int, default=2, help="Pixels averaged, a side.")
+@option(
+    "--color", type=float, nargs=3, metavar="RED GREEN BLUE",
+    help="Centers of the filters [nm] of a color sensor (IMX250MYR), such as 610 530 460: the "
+    "frame as it was read, before any color is filled in.",
+)  # fmt: skip
+@option("--bin", type=int, help="Pixels averaged, a side.  [default: 2; in color 4]")
 def mosaic(frame: Path, layout: tuple[float, ...], out: Path, **options: Any) -> None:
-    """Import one raw frame of a polarization camera."""
+    """Import one raw frame of a polarization camera: monochrome, or in color with --color."""
     options["layout"] = layout[:2], layout[2:]
     _save_image(pb.from_mosaic(frame, **_image_arguments(options)), out)
 

@@ -39,6 +39,8 @@ KEYWORDS = {
     **{name: f"--{name}" for name in ("precision", "preset", "s", "scene", "scheduler", "seed")},
     **{name: f"--{name}" for name in ("setup", "sheet", "table", "transfer", "truth")},
     "angle_is": "--angle-is",
+    "color": "--color",
+    "saturation_level": "--saturation-level",
     "delta": "--delta",
     "mueller": "--mueller",
     "psi": "--psi",
