@@ -39,6 +39,7 @@ KEYWORDS = {
     **{name: f"--{name}" for name in ("precision", "preset", "s", "scene", "scheduler", "seed")},
     **{name: f"--{name}" for name in ("setup", "sheet", "table", "transfer", "truth")},
     "angle_is": "--angle-is",
+    "aolp_from": "--aolp-from",
     "color": "--color",
     "saturation_level": "--saturation-level",
     "delta": "--delta",
