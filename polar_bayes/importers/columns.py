@@ -280,7 +280,12 @@ def _workbook(file: Path, content: bytes, sheet: str | None) -> Cells:
     if name not in sheets:
         hint = f"choose from {', '.join(sheets)}"
         raise CaptureError(f"there is no sheet {name!r}", where=str(file), hint=hint)
-    lines = [Line(k, cells) for k, cells in enumerate(sheets[name], 1) if any(cells)]
+    width = max(map(len, sheets[name]), default=0)
+    lines = [
+        Line(k, [*cells, *[""] * (width - len(cells))])
+        for k, cells in enumerate(sheets[name], 1)
+        if any(cells)
+    ]
     return Cells(f"{file}: sheet {name}", lines, "", [f"sheet {name!r} was read"])
 
 

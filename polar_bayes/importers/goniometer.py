@@ -36,7 +36,7 @@ which neither channel saw light has no q: valid=False.
 import dataclasses
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from decimal import Decimal
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -91,10 +91,8 @@ def from_goniometer(
         unpolarized: The same for unpolarized light without an analyzer, in place of s and p.
         table: A text table or .xlsx workbook that holds angle and channels as columns.
         angle: With `table`, the name of the column of angles in degrees.
-        angle_is: What the angles are: "incidence" (whose absolute value is taken, so that a scan
-            may pass zero), "from-surface", "two-theta" (twice the angle of incidence) or
-            "deviation" (of the beam, 180 less that); by default the angle of incidence, 0 or
-            larger.
+        angle_is: What the angles are: "incidence", "from-surface", "two-theta" or "deviation"
+            (`polar_bayes.importers.mirror`), with any sign; by default incidence, 0 or larger.
         sheet: Sheet of a workbook, where several hold something.
         s_incident: Reading of the incident s light, by the same detector. Without the incident
             levels, s and p are taken to be on the same scale.
@@ -110,60 +108,75 @@ def from_goniometer(
         name: Name of the capture; default: that of the table.
 
     Returns:
-        The validated capture: dop, q, intensity, their errors, `valid` and `interpolated`; of one
-        channel intensity, its error and `valid`. The attribute `import_notes` says what was done
-        to the readings.
+        The validated capture: dop, q, intensity, their errors, `valid` and `interpolated`, or of
+        one channel intensity and its error. `import_notes` says what was done to the readings.
 
     Raises:
         CaptureError: An option, a file, a line or a reading that is wrong.
     """
-    LEVEL.check(dark_level, "dark_level")
-    if relative_error is not None:
-        Interval(0.0, 1.0, open_high=True).check(relative_error, "relative_error")
-    given = _check_levels(
-        dark_level, s_incident=s_incident, p_incident=p_incident, s_error=s_error, p_error=p_error
-    )
     asked = {"s": s, "p": p, "unpolarized": unpolarized}
+    given = _check_levels(
+        dark_level, relative_error,
+        s_incident=s_incident, p_incident=p_incident, s_error=s_error, p_error=p_error,
+    )  # fmt: skip
     _check_channels(asked, given)
-    files = asked.values() if table is None else [table]
-    paths = [Path(each) for each in files if isinstance(each, str | os.PathLike)]
     channels = {
         key: rows.at_incidence(angle_is)
         .averaged(relative_error)
         .scaled(dark_level, given.get(f"{key}_incident"), given.get(f"{key}_error"))
         for key, rows in _read(asked, table, angle, sheet).items()
     }
-    units = "1" if any(key.endswith("_incident") for key in given) else "arbitrary"
-    if len(channels) == 2:
-        capture = _combined(channels["s"], channels["p"], units)
-    else:
-        capture = _alone(next(iter(channels.values())), units)
-    notes = dict.fromkeys(note for each in channels.values() for note in each.notes)
-    known_scatter = relative_error is None and any(x.by_scatter for x in channels.values())
-    default = RELATIVE_ERROR if relative_error is None else float(relative_error)
-    capture = capture.assign_attrs(
+    files = asked.values() if table is None else [table]
+    paths = [Path(each) for each in files if isinstance(each, str | os.PathLike)]
+    capture = _views(channels, given).assign_attrs(
         name=name or ", ".join(source.stem for source in paths) or "goniometer",
         source=", ".join(source.name for source in paths) or "arrays",
         setup="goniometer",
-        incident_levels="not given" if units == "arbitrary" else "given",
         dark_level=float(dark_level),
-        relative_error="scatter of the repeats" if known_scatter else default,
         angle_set_by=angle_set_by,
-        readings_at_zero=int(sum((c.light == 0.0).sum() for c in channels.values())),
         **given,
-        **({"import_notes": "; ".join(notes)} if notes else {}),
+        **_told(channels.values(), relative_error),
     )
     if wavelength is not None:
         capture = capture.assign_coords(wavelength=POSITIVE.check(wavelength, "wavelength"))
-    if "q" in capture:
+    if len(channels) == 2:
         _refuse_swapped(capture)
-        if angle_is is None:
-            _refuse_angles_from_surface(capture)
+        _refuse_angles_from_surface(capture, angle_is)
     return validate(capture, source=capture.attrs["name"])
 
 
-def _check_levels(dark_level: float, **levels: float | None) -> dict[str, float]:
+def _views(channels: Mapping[str, "Channel"], given: Mapping[str, float]) -> xr.Dataset:
+    """The views of both channels, or of one alone."""
+    is_share = any(key.endswith("_incident") for key in given)
+    units = "1" if is_share else "arbitrary"
+    if len(channels) == 1:
+        return _alone(next(iter(channels.values())), units)
+    levels = "given" if is_share else "not given"
+    return _combined(channels["s"], channels["p"], units).assign_attrs(incident_levels=levels)
+
+
+def _told(
+    channels: Collection["Channel"], relative_error: float | None
+) -> dict[str, str | int | float]:
+    """What became of the readings, as attributes."""
+    notes = dict.fromkeys(note for each in channels for note in each.notes)
+    error: str | float = RELATIVE_ERROR if relative_error is None else float(relative_error)
+    if relative_error is None and any(each.by_scatter for each in channels):
+        error = "scatter of the repeats"
+    return {
+        "relative_error": error,
+        "readings_at_zero": int(sum((each.light == 0.0).sum() for each in channels)),
+        **({"import_notes": "; ".join(notes)} if notes else {}),
+    }
+
+
+def _check_levels(
+    dark_level: float, relative_error: float | None, **levels: float | None
+) -> dict[str, float]:
     """The incident levels and errors that are given, each in its range."""
+    LEVEL.check(dark_level, "dark_level")
+    if relative_error is not None:
+        Interval(0.0, 1.0, open_high=True).check(relative_error, "relative_error")
     above_dark = dataclasses.replace(LEVEL, low=dark_level)
     errors = Interval(SMALLEST_ERROR, LARGEST_READING, open_high=True)
     return {
@@ -437,10 +450,10 @@ def _interpolation_error(angle: np.ndarray, logs: np.ndarray) -> np.ndarray:
     return np.fmax(residual[:-1], residual[1:]) / 4.0
 
 
-def _refuse_angles_from_surface(capture: xr.Dataset) -> None:
-    """Refuse a Brewster angle below that of vacuum."""
+def _refuse_angles_from_surface(capture: xr.Dataset, angle_is: str | None) -> None:
+    """Refuse a Brewster angle below that of vacuum, unless the scale of the angle was stated."""
     (peak,) = indices_by_eye(capture).values()
-    if peak is not None and peak.high < 1.0:
+    if angle_is is None and peak is not None and peak.high < 1.0:
         what = (
             f"the polarization is largest near {peak.angle:.0f} degrees, which would be Brewster's "
             f"angle of an index of {peak.center:.2f}, below that of vacuum"

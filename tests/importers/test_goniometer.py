@@ -246,6 +246,21 @@ def test_interpolation_between_readings_of_no_light_stays_finite():
     assert np.isfinite(capture["q_error"]).all()
 
 
+def test_a_reading_of_zero_is_as_uncertain_as_its_neighbors_scatter():
+    """A program that cuts off at zero prints a zero whose last digit says nothing of the noise."""
+    noise = 0.4 * np.random.default_rng(2).normal(size=ANGLES.size)
+    s, p = readings(full=100.0)
+    cut = np.maximum(p[1] + noise, 0.0).round(6)
+    cut[7] = 0.0  # at Brewster's angle
+    capture = from_goniometer(s, (ANGLES, cut))
+    at_zero = float(capture["q_error"][7] * 2.0 * capture["intensity"][7] / 2.0)
+    # The scatter of six neighbors around a parabola has three degrees of freedom.
+    assert 0.1 < at_zero < 1.5
+    assert "1 reading of p at zero or below given the scatter" in capture.attrs["import_notes"]
+    stated = from_goniometer(s, (ANGLES, cut), p_error=1e-3)
+    assert float(stated["q_error"][7]) < 1e-2 * float(capture["q_error"][7])
+
+
 # --- refusals ---------------------------------------------------------------------------------
 
 GOOD = ([40.0, 50.0], [2.0, 3.0])
