@@ -32,6 +32,7 @@ from .errors import (
     PolarBayesError as PolarBayesError,
     SceneError as SceneError,
 )
+from .importers.ellipsometer import from_ellipsometer as from_ellipsometer
 from .importers.goniometer import from_goniometer as from_goniometer
 from .importers.images import (
     from_mosaic as from_mosaic,

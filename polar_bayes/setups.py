@@ -28,9 +28,11 @@ from polar_bayes.physics.input_quantities import (
     ToneCurve,
     ViewZenithScale,
 )
-from polar_bayes.physics.instrument import Discrepancy
+from polar_bayes.physics.instrument import Analyzer, ChannelGain, Discrepancy, Instrument
 from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import SCENES, Scene
+from polar_bayes.physics.stokes import LinearPolarization
+from polar_bayes.physics.surface import SmoothSurface
 from polar_bayes.priors import (
     ANGLE_ZERO,
     PRIORS,
@@ -132,6 +134,42 @@ def find_setup(name: str | Setup) -> Setup:
         hint = f"give one of {', '.join(SETUPS)}, or a polar_bayes.Scene"
         raise SceneError("no such scene", where=f"scene={name!r}", hint=hint)
     return SETUPS[name]
+
+
+CHANNELS: Mapping[str, float] = MappingProxyType({"s": 0.0, "p": 90.0})
+"""Angle of the analyzer before each channel, degree."""
+
+
+def as_read(setup: Setup, capture: xr.Dataset) -> Setup:
+    """The set-up as a capture says that it was read: by one channel, or by polarized light."""
+    if "light_angle" in capture.get("u", xr.DataArray()).attrs:
+        return _by_polarized_light(setup, float(capture["u"].attrs["light_angle"]))
+    if {"dop", "q", "u"} & set(capture.data_vars) or "intensity" not in capture:
+        return setup
+    return _of_one_channel(setup, capture)
+
+
+def _by_polarized_light(setup: Setup, angle: float) -> Setup:
+    """The light of an ellipsometer, of which u tells the phase between s and p."""
+    surface = setup.scene.surface
+    if not isinstance(surface, SmoothSurface) or "q" not in setup.links:
+        return setup
+    beam = PointSource(LinearPolarization(angle=angle))
+    scene = dataclasses.replace(setup.scene, surface=dataclasses.replace(surface, beam=beam))
+    links = {"u": setup.links["q"], **setup.links}
+    return dataclasses.replace(setup, scene=scene, links=links)
+
+
+def _of_one_channel(setup: Setup, capture: xr.Dataset) -> Setup:
+    """The analyzer of a channel is part of the scene, its gain is part of the exposure."""
+    scene, angle = setup.scene, CHANNELS.get(str(capture["intensity"].attrs.get("channel")))
+    scene = scene.without(ChannelGain) if scene.has(ChannelGain) else scene
+    if angle is not None and not scene.has(Analyzer):
+        terms = scene.instrument.terms if scene.instrument else ()
+        scene = dataclasses.replace(scene, instrument=Instrument((*terms, Analyzer(angle))))
+    stated = "intensity_error" in capture
+    link = setup.links.get("intensity", StudentTLink(stated_errors=stated))
+    return dataclasses.replace(setup, scene=scene, links={**setup.links, "intensity": link})
 
 
 def setup_name(setup: Setup) -> str:

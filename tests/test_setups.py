@@ -2,13 +2,14 @@
 
 import inspect
 
+import numpy as np
 import pytest
 from cases import each
 
 import polar_bayes as pb
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.scene import SCENES, Scene
-from polar_bayes.setups import SETUPS, Setup, find_setup
+from polar_bayes.setups import SETUPS, Setup, as_read, find_setup
 
 
 @each("name", SETUPS)
@@ -52,6 +53,35 @@ def test_an_unknown_name_is_answered_with_the_known_ones(name):
 def test_the_docstring_of_a_setup_names_every_field():
     for field in Setup.__dataclass_fields__:
         assert f"{field}:" in inspect.getdoc(Setup)
+
+
+def test_a_set_up_is_taken_as_its_capture_was_read():
+    """One channel has its analyzer, an ellipsometer its light; nothing changes of any other."""
+    angles = np.arange(20.0, 80.0, 5.0)
+    s, p = (angles, 1.0 + angles), (angles, 90.0 - angles)
+    setup = SETUPS["goniometer"]
+    assert as_read(setup, pb.from_goniometer(s, p)) is setup
+    for channel, angle in (("s", 0.0), ("p", 90.0)):
+        alone = as_read(setup, pb.from_goniometer(**{channel: s}))
+        assert alone.scene.instrument.terms[-1] == pb.instrument.Analyzer(angle)
+        assert not alone.scene.has(pb.instrument.ChannelGain)
+        assert alone.links["intensity"].stated_errors
+    whole = as_read(setup, pb.from_goniometer(unpolarized=s))
+    assert not whole.scene.has(pb.instrument.Analyzer)
+    turned = pb.from_goniometer(s, p)
+    turned["u"], turned["u_error"] = 0.1 * turned["q"], turned["q_error"]
+    turned["u"].attrs = {"light_angle": -45.0}
+    lit = as_read(setup, turned)
+    assert lit.scene.surface.beam.polarization.angle == -45.0
+    assert lit.links["u"] == lit.links["q"]
+
+
+@pytest.mark.thorough
+def test_channels_of_different_light_are_not_combined():
+    angles = np.arange(20.0, 80.0, 5.0)
+    s, p = pb.from_goniometer(s=(angles, angles)), pb.from_goniometer(p=(angles, angles))
+    with pytest.raises(pb.CaptureError, match="channel of intensity is p, that of s s"):
+        pb.capture.combine({"s": s, "p": p})
 
 
 def test_every_parameter_is_explained_in_words():

@@ -100,7 +100,7 @@ def _check_variables(label: str, capture: xr.Dataset, first: str, pattern: xr.Da
             with_, without = (label, first) if name in capture else (first, label)
             hint = f"add it there, or {drop}"
             raise CaptureError(f"{without} has no {name}, and {with_} has", where=where, hint=hint)
-        for attribute in ("units", "saturation_level"):
+        for attribute in ("units", "saturation_level", "channel"):
             own, other = (each[name].attrs.get(attribute) for each in (capture, pattern))
             if own != other:
                 what = f"{attribute} of {name} is {_text(own)}, that of {first} {_text(other)}"

@@ -66,6 +66,7 @@ class IndexByEye(NamedTuple):
     def is_beyond(self, bounds: tuple[float, float]) -> bool:
         """Whether a prior ends before the middle, and is not narrower than the range itself."""
         within = self.low <= bounds[0] and bounds[1] <= self.high
+        within = within or self.high < 1.0  # no prior mends that
         return self.is_pure and not within and not bounds[0] <= self.center <= bounds[1]
 
     def is_excluded(self, bounds: tuple[float, float], degrees: float = 0.0) -> bool:
@@ -172,13 +173,14 @@ def inferred(capture: xr.Dataset) -> tuple[str, ...]:
 
 
 def stated(capture: xr.Dataset) -> tuple[str, ...]:
-    """What a capture states for its fits: the set-up and the incident levels.
+    """What was done to the file of a capture, and what it states for its fits.
 
     Args:
         capture: A validated capture.
 
     Returns:
-        A sentence on the set-up, and one on the incident levels of a goniometer.
+        A sentence on what an import left out, read otherwise or averaged, one on the set-up, and
+        one on the incident levels of a goniometer.
     """
     setup = (
         "Set-up: not stated, so a fit takes 'polarimeter', a point source and an unsigned degree "
@@ -193,7 +195,9 @@ def stated(capture: xr.Dataset) -> tuple[str, ...]:
             "ratio of their gains (channel_gain_ratio) a wider prior than otherwise.",
         ),
     }
-    return (setup, *levels.get(capture.attrs.get("incident_levels", ""), ()))
+    notes = capture.attrs.get("import_notes")
+    done = (f"Import: {notes}.",) if notes else ()
+    return (*done, setup, *levels.get(capture.attrs.get("incident_levels", ""), ()))
 
 
 # --- Directions -----------------------------------------------------------------------------------
@@ -353,8 +357,8 @@ def _scale_cautions(name: str, capture: xr.Dataset) -> Iterator[str]:
         yield (
             f"The polarization{name} is largest near {peak.angle:.0f} degrees, which would be "
             f"Brewster's angle of an index of {peak.center:.2f}, below that of vacuum: the angles "
-            "were likely counted from the surface; give 90 degrees less each of them, from the "
-            "normal."
+            "were likely counted from the surface, which an import takes by "
+            "angle_is='from-surface'."
         )
 
 

@@ -15,6 +15,7 @@ from polar_bayes.cli.options import (
     MATERIAL,
     SCENE,
     Command,
+    Name,
     all_of,
     command,
     link_option,
@@ -24,6 +25,7 @@ from polar_bayes.cli.options import (
     seed_option,
 )
 from polar_bayes.cli.printing import print_cautions, say
+from polar_bayes.errors import CaptureError
 
 if TYPE_CHECKING:
     from polar_bayes.results import Capture
@@ -117,6 +119,15 @@ angle_option = option(
 )  # fmt: skip
 
 
+SCALES = "incidence", "from-surface", "two-theta", "deviation"
+angle_is_option = option(
+    "--angle-is", type=Name("scale of the angle", SCALES, CaptureError),
+    help=f"What the angles are: {', '.join(SCALES)} of the beam. Absolute values are taken, so "
+    "that a scan may pass zero. Without it: incidence, degrees from the surface normal, 0 or more.",
+)  # fmt: skip
+sheet_option = option("--sheet", help="Sheet of an .xlsx workbook, where several hold something.")
+
+
 # --- Commands that import raw measurements --------------------------------------------------------
 
 
@@ -126,36 +137,100 @@ def import_() -> None:
 
 
 @import_.command(cls=Command)
-@option("--s", "s", type=COLUMN_OR_INPUT, required=True, help="Table of s, or column of --table.")
-@option("--p", "p", type=COLUMN_OR_INPUT, required=True, help="Table of p, or column of --table.")
-@option("--table", type=INPUT, help="One table with both channels.")
-@option("--angle", help="Column of --table with the angle of incidence in degrees.")
+@option("--s", "s", type=COLUMN_OR_INPUT, help="Table of s, or column of --table.")
+@option("--p", "p", type=COLUMN_OR_INPUT, help="Table of p, or column of --table.")
+@option(
+    "--unpolarized", type=COLUMN_OR_INPUT,
+    help="The same of unpolarized light without an analyzer, in place of --s and --p.",
+)  # fmt: skip
+@option("--table", type=INPUT, help="One table, text or .xlsx, with all channels.")
+@option("--angle", help="Column of --table with the angle.")
+@angle_is_option
+@sheet_option
 @option("--s-incident", type=float, help="Reading of the incident beam, s.")
 @option("--p-incident", type=float, help="Reading of the incident beam, p.")
 @option("--dark-level", type=float, default=0.0, help="Reading without light.")
 @option("--s-error", type=float, help="Absolute error of an s reading.")
 @option("--p-error", type=float, help="Absolute error of a p reading.")
-@option("--relative-error", type=float, default=0.01)
+@option(
+    "--relative-error", type=float,
+    help="Error of a reading over the reading; by default the scatter of repeats, or 0.01.",
+)  # fmt: skip
 @angle_option
 @wavelength_option
 @name_option
 @out_capture
 def goniometer(out: Path, **settings: Any) -> None:
-    """Import s and p readings against the angle of incidence, from one table or two."""
+    """Import s and p readings against the angle, from one table or two, or one of them alone.
+
+    Lines without an angle are left out, readings at one angle are averaged, and all that is done
+    is told.
+    """
     _save_import(pb.from_goniometer(**settings), out)
+
+
+@import_.command(cls=Command)
+@option("--table", type=INPUT, required=True, help="Text, .xlsx, or a .dat file of WVASE.")
+@option("--angle", help="Column with the angle, or the angle of all lines in degrees.")
+@angle_is_option
+@option("--psi", multiple=True, help="Column of psi; give it once for each wavelength.")
+@option("--delta", multiple=True, help="Column of delta, for u as well; once for each wavelength.")
+@option(
+    "--mueller",
+    help="In place of --psi, elements m00... or m11...: column (the light was unpolarized) or row "
+    "(the detector was blind to polarization).",
+)  # fmt: skip
+@option(
+    "--wavelength", multiple=True,
+    help="Column of wavelengths, or nanometers: of all lines, or once for each --psi.",
+)  # fmt: skip
+@option("--unit", help="Of psi and delta: degree or radian.  [default: degree]")
+@option("--psi-error", help="Error of psi, or its column.  [default: 0.1 degrees]")
+@option("--delta-error", help="Error of delta, or its column.  [default: 0.2 degrees]")
+@sheet_option
+@option("--angle-set-by", default="stage", help="stage, hand or lens.")
+@name_option
+@out_capture
+def ellipsometer(table: Path, out: Path, wavelength: tuple[str, ...], **settings: Any) -> None:
+    """Import psi and delta, or Mueller elements, against the angle.
+
+    Without --psi and --mueller the table is a .dat file of WVASE, whose lines of other kinds than
+    E are left out and counted. A plate with a polished back sends back light of its back face too.
+    """
+    for key in ("angle", "psi_error", "delta_error"):
+        settings[key] = _number_or_column(settings[key])
+    waves = [_number_or_column(each) for each in wavelength]
+    settings["wavelength"] = waves if len(waves) > 1 else next(iter(waves), None)
+    _save_import(pb.from_ellipsometer(table, **settings), out)
+
+
+def _number_or_column(text: str | None) -> float | str | None:
+    """A number, or the name of a column."""
+    try:
+        return None if text is None else float(text)
+    except ValueError:
+        return text
 
 
 @import_.command(cls=Command)
 @click.argument("table", type=INPUT)
 @option(
     "--column", "columns", type=(str, str), multiple=True, metavar="VARIABLE COLUMN",
-    help="Column of a variable, where it has another name; give it once for each.",
+    help="Column of a variable, where it has another name; give it once for each. With dop and "
+    "aolp, the angle of polarization in degrees, q and u follow.",
 )  # fmt: skip
 @option(
     "--constant", "constants", type=(str, float), multiple=True, metavar="VARIABLE NUMBER",
     help="A variable that is the same everywhere, such as light_zenith 45.",
 )  # fmt: skip
 @option("--ignore", "ignored", multiple=True, metavar="COLUMN", help="Leave it out.")
+@option("--angle", help="Column with the angle of a mirror: of view and light, on opposite sides.")
+@angle_is_option
+@option(
+    "--aolp-from", default="s",
+    help="Axis from which a column aolp counts: s, or p in the plane of normal and viewer.",
+)  # fmt: skip
+@sheet_option
 @option("--setup", help="Set-up that a fit takes by default.")
 @angle_option
 @option("--saturation-level", type=float, help="Intensity of a full pixel.")
@@ -245,9 +320,14 @@ def polarizer(frames: tuple[tuple[float, Path], ...], out: Path, **options: Any)
     "--layout", type=float, nargs=4, default=(90.0, 45.0, 135.0, 0.0),
     help="Angles of the four pixels, row by row [degrees].",
 )  # fmt: skip
-@option("--bin", type=int, default=2, help="Pixels averaged, a side.")
+@option(
+    "--color", type=float, nargs=3, metavar="RED GREEN BLUE",
+    help="Centers of the filters [nm] of a color sensor (IMX250MYR), such as 610 530 460: the "
+    "frame as it was read, before any color is filled in.",
+)  # fmt: skip
+@option("--bin", type=int, help="Pixels averaged, a side.  [default: 2; in color 4]")
 def mosaic(frame: Path, layout: tuple[float, ...], out: Path, **options: Any) -> None:
-    """Import one raw frame of a polarization camera."""
+    """Import one raw frame of a polarization camera: monochrome, or in color with --color."""
     options["layout"] = layout[:2], layout[2:]
     _save_image(pb.from_mosaic(frame, **_image_arguments(options)), out)
 

@@ -49,7 +49,7 @@ from polar_bayes.cli.printing import (
 from polar_bayes.interrupts import on_interrupt
 from polar_bayes.methods.registry import FIT_DEFAULT, MAP_DEFAULT
 from polar_bayes.paths import write_errors
-from polar_bayes.progress import notice, stages
+from polar_bayes.progress import Progress, notice, stages
 
 if TYPE_CHECKING:
     from polar_bayes.results import Result
@@ -69,9 +69,10 @@ def demo(out: Path, seed: int) -> int:
     with stages() as progress:
         result = pb.fit(capture, seed=seed, progress=progress)
         pb.save(result, out / "fit.nc")
-    if _is_new_fit(result):
-        _add_next_views(result)
-    page = pb.report(result, out / "report")
+        if _is_new_fit(result):
+            _add_next_views(result, progress)
+        progress("drawing the report", 0.0)
+        page = pb.report(result, out / "report")
     status = print_fit(result)
     click.echo(f"report: {page}")
     return status
@@ -102,7 +103,7 @@ def _make_folder(folder: Path) -> None:
     help=f"{', '.join(FIT_METHOD.names)}; auto is the cheapest that is good enough.",
 )  # fmt: skip
 @nuts_options
-@option("--seconds", type=float, help="Of --method auto; 60 by default.")
+@option("--seconds", type=float, help="Of --method auto, 60 by default; of --scene auto.")
 @option(
     "--scene", type=FIT_SCENE, metavar="NAME|FILE",
     help=f"{SCENE_HELP} auto: what `scenes` finds.",
@@ -129,8 +130,8 @@ def fit(
     is_auto = settings["method"] == "auto"
     if tolerance is not None and not (choose or is_auto):
         raise click.UsageError("--tolerance needs --choose-effects or --method auto")
-    if settings["seconds"] is not None and not is_auto:
-        raise click.UsageError("--seconds needs --method auto")
+    if settings["seconds"] is not None and not (is_auto or settings["scene"] == "auto"):
+        raise click.UsageError("--seconds needs --method auto or --scene auto")
     with contextlib.ExitStack() as until_compared:
 
         def keep(fit: Any) -> None:
@@ -284,6 +285,7 @@ def scene(source: Path | str, out: Path | None) -> None:
 @out_option(RESULT_FILE, "Fit of the scenes that remain, stacked, to write.", required=False)
 @model_option
 @option("--method", type=FIT_METHOD, default=FIT_DEFAULT, help="Of the fit that --out writes.")
+@option("--seconds", type=float, help="Of the comparison; the first scene is always fitted.")
 @prior_option
 @link_option
 @view_limit_option
@@ -330,16 +332,19 @@ def report(
     comparisons: tuple[Path, ...],
 ) -> None:
     """Write the standardized report of a fit, calibration, accuracy study, or map (.zarr)."""
-    result = pb.load(fit)
-    if next_views and _is_new_fit(result):
-        _add_next_views(result)
-    page = pb.report(
-        result,
-        out,
-        truth=None if truth is None else pb.maps.open_capture(truth),
-        uncorrected=None if uncorrected is None else pb.maps.open_map(uncorrected),
-        comparisons=_load_all(comparisons, "calibration") or None,
-    )
+    with stages() as progress:
+        progress("reading the result", 0.0)
+        result = pb.load(fit)
+        if next_views and _is_new_fit(result):
+            _add_next_views(result, progress)
+        progress("drawing the report", 0.0)
+        page = pb.report(
+            result,
+            out,
+            truth=None if truth is None else pb.maps.open_capture(truth),
+            uncorrected=None if uncorrected is None else pb.maps.open_map(uncorrected),
+            comparisons=_load_all(comparisons, "calibration") or None,
+        )
     click.echo(f"report: {page}")
 
 
@@ -348,11 +353,11 @@ def _is_new_fit(result: "Result") -> bool:
     return "posterior" in result and "next_views" not in result and pb.verdict(result).passed
 
 
-def _add_next_views(result: "Result") -> None:
+def _add_next_views(result: "Result", progress: Progress) -> None:
     """Keep with a fit which views to take next; where that is not known, say why."""
+    progress("looking for the next views", 0.0)
     try:
-        with stages() as progress:
-            result["next_views"] = pb.next_views(result, progress=progress)
+        result["next_views"] = pb.next_views(result, progress=progress)
     except pb.PolarBayesError as error:
         say(f"no next views: {error}", err=True)
 

@@ -37,7 +37,16 @@ FUNCTIONS = {
 KEYWORDS = {
     **{name: f"--{name}" for name in ("angle", "dim", "drop", "keep", "method", "model", "p")},
     **{name: f"--{name}" for name in ("precision", "preset", "s", "scene", "scheduler", "seed")},
-    **{name: f"--{name}" for name in ("setup", "table", "transfer", "truth")},
+    **{name: f"--{name}" for name in ("setup", "sheet", "table", "transfer", "truth")},
+    "angle_is": "--angle-is",
+    "aolp_from": "--aolp-from",
+    "color": "--color",
+    "saturation_level": "--saturation-level",
+    "delta": "--delta",
+    "mueller": "--mueller",
+    "psi": "--psi",
+    "unit": "--unit",
+    "wavelength": "--wavelength",
     "links": "--link",
     "parameter": "--profile",
     "priors": "--prior",
@@ -53,6 +62,8 @@ KEYWORD, FUNCTION = ("|".join(map(re.escape, names)) for names in (KEYWORDS, FUN
 
 RULES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     # What a command cannot do is left to Python, or left out.
+    (r"pb\.from_ellipsometer\(mueller='column'\)",
+     "polar-bayes import ellipsometer --mueller column"),
     (r"goes with pb\.fit only", "is fitted in Python only"),
     (r"fit with load_scene and model= in Python", "fit it in Python"),
     (r"polar_bayes\.save or (?=a command)", ""),

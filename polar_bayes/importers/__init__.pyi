@@ -5,6 +5,7 @@ from .camera_geometry import (
     Surroundings as Surroundings,
 )
 from .detector import Detector as Detector
+from .ellipsometer import from_ellipsometer as from_ellipsometer
 from .goniometer import from_goniometer as from_goniometer
 from .images import from_mosaic as from_mosaic, from_polarizer as from_polarizer
 from .normals import (

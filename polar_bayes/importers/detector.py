@@ -6,7 +6,8 @@ gives the signal, with the variance
 $$ s = (R - D)/F, \qquad
    \sigma^2 = \frac{\sigma_r^2 + 1/12 + g \max(s F, 0)}{F^2 N} + (\epsilon s)^2 $$
 
-with read noise $\sigma_r$ (counts), rounding to whole counts, photon noise of gain g (counts per
+with read noise $\sigma_r$ (counts), rounding to whole counts (or to their common divisor, where 10
+to 14 bits are aligned to the left in 16), photon noise of gain g (counts per
 electron), and N pixels averaged. Averaging does not reduce $\epsilon$: unequal transmission
 of the analyzers, light that flickers, a flat field that has changed.
 
@@ -109,6 +110,11 @@ def read_image(
         raise CaptureError("it is larger than any camera", where=str(file), hint=hint) from error
     except Exception as error:  # Pillow raises many types for a broken file
         hint = "give PNG, TIFF or .npy"
+        if file.suffix.lower() in (".raw", ".bin", ".dat", ".img"):
+            hint = (
+                "a raw file does not say how it is packed: unpack it with NumPy (docs/camera.md "
+                "has the lines for 12 bits), save it as .npy and give that"
+            )
         raise CaptureError("it cannot be read as an image", where=str(file), hint=hint) from error
     if values is not None:
         return values, curve
@@ -181,7 +187,17 @@ def signal_of(frames: Sequence[np.ndarray], level: float | None, detector: Detec
     full = level if detector.saturation_level is None else detector.saturation_level
     if full is None:
         what = "the frames do not say at which count a pixel is full"
-        hint = "give it: 4095 for 12 bits, 65535 for 16 bits"
+        hint = "give it: 4095 for 12 bits, 65535 for 16 bits, 1 for shares of full light"
+        raise CaptureError(what, where="saturation_level", hint=hint)
+    if detector.read_noise >= 0.1 * full:
+        what = f"it is {detector.read_noise:g}, and a pixel is full at {full:g}"
+        hint = "give read_noise and gain in the unit of the frames, such as 1/4095 for 12 bits"
+        raise CaptureError(what, where="read_noise", hint=hint)
+    step = _count_step(frames)
+    if step > 1 and full % step:
+        bits = 16 - (step.bit_length() - 1)
+        what = f"all counts are multiples of {step}: {bits} bits aligned to the left"
+        hint = f"give the full count as it stands in the file, saturation_level={65536 - step}"
         raise CaptureError(what, where="saturation_level", hint=hint)
     transfer = as_transfer(detector.transfer)
     white = full if level is None else level
@@ -199,7 +215,8 @@ def signal_of(frames: Sequence[np.ndarray], level: float | None, detector: Detec
         hint = "check it and the saturation level"
         raise CaptureError(f"it reaches the full count {full:g}", where="dark", hint=hint)
     flat = _flat(detector, shape, linear)
-    rounding = linear(raw + 0.5) - linear(raw - 0.5)
+    half = 0.5 * step if full > 1.0 else 0.0  # shares of full light are no whole numbers
+    rounding = linear(raw + half) - linear(raw - half)
     raw, dark, full = linear(raw), linear(dark), float(linear(np.array(float(full))))
     # Electrons that fill a pixel of a machine-vision sensor.
     gain = full / 10_000.0 if detector.gain is None else float(detector.gain)
@@ -222,6 +239,16 @@ def signal_of(frames: Sequence[np.ndarray], level: float | None, detector: Detec
             "relative_error": float(detector.relative_error),
         },
     )
+
+
+def _count_step(frames: Sequence[np.ndarray]) -> int:
+    """What all counts of wide frames are multiples of, a power of two from 4 on; else 1."""
+    values = np.unique(np.stack(frames))
+    # Few different counts may have a divisor by chance, and 8 bits are not aligned.
+    if values.size < 16 or values[-1] < 1024 or (values % 1.0).any():
+        return 1
+    step = int(np.gcd.reduce(values.astype(np.int64)))
+    return step if step >= 4 and step & (step - 1) == 0 else 1
 
 
 def _flat(

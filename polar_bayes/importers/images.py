@@ -21,6 +21,10 @@ the average has the variance
 $$ \sigma^2_{mean} = \Big(\frac{2b - 3/2}{b^2}\Big)^2 \sigma^2 $$
 
 for even b. (Averages of pixels that were read independently would have 4/b^2.)
+
+A color mosaic repeats such squares of four behind the colors of a Bayer pattern, red at the upper
+left. polanalyser fills in colors first, then angles; the share of each pixel in the average over a
+block is measured, by a frame in which that pixel alone is bright. The colors become wavelengths.
 """
 
 import dataclasses
@@ -361,6 +365,10 @@ AT = ((1, 1), (0, 1), (0, 0), (1, 0))
 """Row and column of the pixels that polanalyser takes for 0, 45, 90 and 135 degrees."""
 
 
+REACH = 4
+"""Pixels from which polanalyser fills in, at most, in a color mosaic."""
+
+
 def from_mosaic(
     frame: Frame,
     *,
@@ -368,30 +376,34 @@ def from_mosaic(
     light: AbstractLocation | Highlight | Surroundings | Sequence[float],
     view: AbstractLocation | Sequence[float] = FACING,
     layout: ArrayLike = SONY,
+    color: Sequence[float] | None = None,
     detector: Detector | None = None,
-    bin: int = 2,
+    bin: int | None = None,
     window: int = 2,
     wavelength: float | None = None,
     name: str | None = None,
 ) -> xr.Dataset:
-    """A capture from one frame of a polarization camera without color.
+    """A capture from one raw frame of a polarization camera, monochrome or in color.
 
     Args:
         frame: A PNG, TIFF, JPEG or .npy file, or an array of shape (row, column): raw counts, with
-            an even number of rows and columns.
+            an even number of rows and columns; one of a color sensor before any color is filled in.
         shape: See `polar_bayes.from_polarizer`; the arguments that are not explained here too.
         light: Location of the light.
         view: Location of the camera.
         layout: Angle of the polarizer of each of the four pixels, two rows of two, in degrees from
             x counterclockwise as the camera sees it.
+        color: Center of the red, green and blue filter, nm, of a color sensor such as IMX250MYR;
+            None: monochrome.
         detector: How counts become light, and their noise.
-        bin: Width of the squares of pixels that are averaged into one reading; even.
+        bin: Width of the squares of pixels that are averaged into one reading; even, by default 2;
+            of a color sensor a multiple of 4, by default 4.
         window: Readings along each side of a pixel of the capture: window^2 views.
         wavelength: In nm, > 0.
         name: Of the capture; by default that of the file.
 
     Returns:
-        As `polar_bayes.from_polarizer` does.
+        As `polar_bayes.from_polarizer` does; in color with the dim wavelength, short ones first.
 
     Raises:
         CaptureError: polanalyser is not installed, the frame, a place or an option is wrong, or no
@@ -403,36 +415,100 @@ def from_mosaic(
     if counts.shape[0] % 2 or counts.shape[1] % 2:
         hint = "give the frame as the sensor has it, from its first row and column"
         raise CaptureError(f"it is {counts.shape}, not even", where="frame", hint=hint)
-    binning = Binning(counts.shape, bin, window)
-    if binning.bin % 2:
+    period = 2 if color is None else 4
+    binning = Binning(counts.shape, period if bin is None else bin, window)
+    if binning.bin % period:
         hint = "give an even number: each square holds all four polarizers"
+        if color is not None:
+            hint = "give a multiple of 4: each square holds all four polarizers of each color"
         raise CaptureError(f"it is {bin}", where="bin", hint=hint)
+    centers = _centers(color, wavelength)
     geometry, placement = _locate(shape, view, light, binning)
     signal = signal_of([counts], level, detector)
     version = f"polanalyser {importlib.metadata.version('polanalyser')}, bilinear"
-    return _capture(
-        binning.mean(_demosaiced(polanalyser, signal.light[0])),
-        _variance(signal.variance[0], binning),
-        # A full pixel spreads to the neighbors that are filled in from it.
-        binning.any(binary_dilation(signal.saturated[0], np.ones((3, 3), bool))),
-        angles,
-        binning=binning,
-        geometry=geometry,
-        signal=signal,
-        attributes=_names([frame], name, "mosaic") | placement | {"demosaicing": version},
-        wavelength=wavelength,
-    )
+    # A full pixel spreads to the neighbors that are filled in from it.
+    spread = np.ones((2 * period - 1,) * 2, bool)
+    filled = _demosaiced(polanalyser, signal.light[0], is_color=color is not None)
+    captures = [
+        _capture(
+            binning.mean(filled[..., k]),
+            _variance(signal.variance[0], binning)
+            if color is None
+            else _color_variance(polanalyser, signal.variance[0], binning, k),
+            binning.any(binary_dilation(signal.saturated[0], spread)),
+            angles,
+            binning=binning,
+            geometry=geometry,
+            signal=signal,
+            attributes=_names([frame], name, "mosaic") | placement | {"demosaicing": version},
+            wavelength=center,
+        )
+        for k, center in enumerate(centers)
+    ]
+    return captures[0] if color is None else _spectral(captures)
 
 
-def _demosaiced(polanalyser: ModuleType, light: np.ndarray) -> np.ndarray:
-    """Light at each angle in every pixel, (angle, row, column)."""
+def _centers(color: Sequence[float] | None, wavelength: float | None) -> tuple[float | None, ...]:
+    """The wavelength of each color, blue first."""
+    if color is None:
+        return (wavelength,)
+    if wavelength is not None:
+        hint = "leave it out: color= has three"
+        raise CaptureError("a color mosaic has no one wavelength", where="wavelength", hint=hint)
+    centers = as_numbers(color)
+    if centers.shape != (3,) or not (np.diff(centers) < 0.0).all():
+        hint = "give the centers of red, green and blue in nm, such as 610 530 460"
+        raise CaptureError(f"it is {color!r}", where="color", hint=hint)
+    return tuple(centers[::-1].tolist())
+
+
+def _spectral(captures: Sequence[xr.Dataset]) -> xr.Dataset:
+    """The captures of all colors as one with wavelengths; masked readings are counted together."""
+    kept = [name for name in captures[0].data_vars if str(name).endswith(("zenith", "azimuth"))]
+    colors = xr.concat([each.drop_vars(kept) for each in captures], "wavelength")
+    attributes = dict(captures[0].attrs)
+    for name in attributes:
+        if str(name).startswith("masked_") or name == "dop_at_one":
+            attributes[name] = sum(int(each.attrs[name]) for each in captures)
+        elif str(name).startswith(("measured_gamma", "median_misfit")):
+            attributes[name] = float(np.median([each.attrs.get(name, np.nan) for each in captures]))
+    merged = xr.merge([captures[0][kept].drop_vars("wavelength"), colors]).assign_attrs(attributes)
+    return validate(merged, source=str(attributes["name"]))
+
+
+def _demosaiced(polanalyser: ModuleType, light: np.ndarray, *, is_color: bool) -> np.ndarray:
+    """Light at each angle in every pixel, (angle, row, column, color), blue first."""
     # The library works on whole numbers up to 65535 and cuts off what lies outside. Filling in is
     # linear, so the frame is shifted and stretched to just that range and back: dark pixels whose
     # noise lies below zero stay what they are.
     low, high = float(light.min()), float(light.max())
     step = (high - low) / 65535.0 if high > low else 1.0
     whole = np.rint((light - low) / step).astype(np.uint16)
-    return np.stack(polanalyser.demosaicing(whole)).astype(np.float64) * step + low
+    code = polanalyser.COLOR_PolarRGB if is_color else polanalyser.COLOR_PolarMono
+    filled = np.stack(polanalyser.demosaicing(whole, code)).astype(np.float64) * step + low
+    return filled if is_color else filled[..., None]
+
+
+def _color_variance(
+    polanalyser: ModuleType, variance: np.ndarray, binning: Binning, color: int
+) -> np.ndarray:
+    """Variance of the average of each angle over each bin, of one color, (angle, row, column)."""
+    b, width = binning.bin, binning.bin + 4 * REACH
+    block = slice(2 * REACH, 2 * REACH + b)
+    square, ours = np.zeros(4), np.zeros((4, width, width), bool)
+    for row, column in np.ndindex(width, width):
+        bright = np.zeros((width, width))
+        bright[row, column] = 1.0
+        share = _demosaiced(polanalyser, bright, is_color=True)[:, block, block, color]
+        share = share.mean(axis=(1, 2))
+        ours[:, row, column] = share > 0.0
+        square += share**2
+    tiles = tuple(-(-n // b) for n in variance.shape)
+    found = []
+    for k in range(4):
+        mine = np.tile(ours[k, block, block], tiles)[: variance.shape[0], : variance.shape[1]]
+        found.append(square[k] * binning.mean(np.where(mine, variance, 0.0)) / mine[:b, :b].mean())
+    return np.stack(found)
 
 
 def _variance(variance: np.ndarray, binning: Binning) -> np.ndarray:

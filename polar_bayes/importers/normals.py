@@ -17,8 +17,8 @@ from scipy.optimize import least_squares
 
 from polar_bayes.capture.schema import Interval, as_numbers
 from polar_bayes.errors import CaptureError
+from polar_bayes.importers.columns import read_table
 from polar_bayes.importers.detector import os_name, read_array
-from polar_bayes.importers.table import read_table
 
 
 class AbstractShape(abc.ABC):
@@ -198,6 +198,7 @@ def fit_sphere(rim: ArrayLike | os.PathLike[str]) -> Sphere:
     if isinstance(rim, str | os.PathLike):
         table = read_table(rim, ["row", "column"])
         where, points = table.source, np.stack([table.columns["row"], table.columns["column"]], -1)
+        points = points[np.isfinite(points).all(axis=1)]
     else:
         where, points = "rim", _points(rim)
     if len(points) < 4:

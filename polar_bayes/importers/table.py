@@ -6,21 +6,18 @@
 
 A line is a view. If there is a column `wavelength`, lines of the same directions are one view; a
 line that repeats both begins another view. A column `patch` or `material` combines captures as
-`polar_bayes.capture.combine` does. Entries that no line holds are `valid=False`.
+`polar_bayes.capture.combine` does. Entries that no line holds, and lines in which the cell of a
+reading is blank, are `valid=False`. A reading with its uncertainty in one cell, such as 0.12(1) or
+0.12±0.01, is reading and error. A column `aolp` (angle of linear polarization) makes q and u of
+`dop`:
 
-The parser is our own and strict, since the well-kept ones guess: `csv.Sniffer` takes the separator
-from letter frequencies and fails on short tables; `pandas.read_csv` fills short rows, turns a
-surplus column into an index and names no line; `numpy.genfromtxt` turns text into NaN. None keeps
-the printed digits, which give a reading's resolution.
+    q = dop cos(2 aolp),    u = dop sin(2 aolp)
 """
 
-import dataclasses
-import math
 import os
 import re
 import sys
-from collections.abc import Collection, Mapping, Sequence
-from decimal import Decimal
+from collections.abc import Mapping, Sequence
 from numbers import Real
 from pathlib import Path
 
@@ -29,11 +26,28 @@ import pandas as pd
 import xarray as xr
 
 from polar_bayes.capture.combine import DIMS, PER_VIEW, combine
-from polar_bayes.capture.schema import CONTRACT, WAVELENGTH, hint_for, nearest_name, validate
+from polar_bayes.capture.schema import (
+    CONTRACT,
+    WAVELENGTH,
+    Interval,
+    Variable,
+    hint_for,
+    nearest_name,
+    validate,
+)
 from polar_bayes.errors import CaptureError
-from polar_bayes.paths import existing_file, system_error
+from polar_bayes.importers.columns import Table, check_column, counted, read_table
+from polar_bayes.importers.mirror import as_incidence
 
-KNOWN = {row.name: row for row in (*CONTRACT, WAVELENGTH)}
+AOLP = Variable(
+    "aolp", "reading", "degree", Interval(-360.0, 360.0), "angle of linear polarization",
+    "give degrees from the s axis, or from the p axis by aolp_from='p'", "dop",
+)  # fmt: skip
+KNOWN = {row.name: row for row in (*CONTRACT, WAVELENGTH, AOLP)}
+AXES = {"s": 0.0, "p": 90.0}
+"""Angle of each axis from the s axis, degree."""
+MUELLER = re.compile(r"[mM]_?\[?([0-4])_?,?([0-4])\]?")
+"""Name of an element of a Mueller matrix."""
 
 
 def from_table(
@@ -42,6 +56,10 @@ def from_table(
     columns: Mapping[str, str] | None = None,
     constants: Mapping[str, float] | None = None,
     ignored: Sequence[str] = (),
+    angle: str | None = None,
+    angle_is: str | None = None,
+    aolp_from: str = "s",
+    sheet: str | None = None,
     setup: str | None = None,
     angle_set_by: str = "hand",
     saturation_level: float | None = None,
@@ -50,12 +68,19 @@ def from_table(
     """A capture from a table with a line for each reading; see the module.
 
     Args:
-        table: A text table of numbers whose first line names the columns. Columns that are named
-            as the variables of a capture (`view_zenith` in degrees, `dop`, ...) are these.
+        table: A text table or .xlsx workbook whose first line names the columns. Columns that are
+            named as the variables of a capture (`view_zenith` in degrees, `dop`, ...) are these.
         columns: Column of a variable, where it has another name: `{"dop": "DoLP"}`. One column may
-            be several: the angle of a mirror is that of view and light.
+            be several. `aolp`, in degrees, is the angle of linear polarization.
         constants: Variables that are the same everywhere: `{"light_zenith": 45.0}`.
         ignored: Columns to leave out.
+        angle: Column with the angle of a mirror: of view and light, on opposite sides.
+        angle_is: What that angle is: "incidence" (whose absolute value is taken), "from-surface",
+            "two-theta" or "deviation" (`polar_bayes.importers.mirror`); by default the angle of
+            incidence, 0 or larger.
+        aolp_from: The axis from which `aolp` counts: "s" (perpendicular to the plane of normal and
+            viewer) or "p" (in that plane).
+        sheet: Sheet of a workbook, where several hold something.
         setup: Which scene, links and limits a fit takes by default; None: those of "polarimeter".
         angle_set_by: How the angles were set: "stage", "hand" or "lens"; a fit takes the prior of
             `angle_zero` from it (`polar_bayes.priors.ANGLE_ZERO`).
@@ -68,40 +93,54 @@ def from_table(
     Raises:
         CaptureError: The column, or the line and number, that is wrong.
     """
-    source = str(table)
-    names, rows = _read_cells(source)
-    columns = _columns(names, columns or {}, ignored, source)
-    constants = constants or {}
-    _check_constants(constants, columns, source)
-    read = _as_numbers(source, names, rows, columns.values())
-    values = {variable: read.columns[column] for variable, column in columns.items()}
-    values |= {variable: np.full(len(read.lines), float(x)) for variable, x in constants.items()}
-    _check_values(values, columns, read.lines, source)
-    leading = [dim for dim in DIMS if dim in values]
-    if len(leading) > 1:
-        hint = "ignore one of both"
-        raise CaptureError("it has materials and patches", where=source, hint=hint)
-    if leading:
-        labels = values.pop(leading[0])
-        parts = {
-            # All digits: two numbers never have one label. Adding zero turns -0.0 into 0.0.
-            repr(float(label) + 0.0).removesuffix(".0"): _capture(
-                {name: x[labels == label] for name, x in values.items()}, saturation_level
-            )
-            for label in np.unique(labels)
-        }
-        capture = combine(parts, dim=leading[0])
-    else:
-        capture = _capture(values, saturation_level)
+    given, constants, used = dict(columns or {}), dict(constants or {}), {}
+    _check_options(angle, angle_is, aolp_from)
+    if angle is not None:
+        given |= {"view_zenith": angle, "light_zenith": angle}
+        constants = {"view_azimuth": 180.0, "light_azimuth": 0.0, **constants}
+
+    def chosen(names: list[str]) -> list[str]:
+        """The columns that are used; a line without the first one is left out."""
+        used.update(_columns(names, given, ignored, str(table)))
+        _check_constants(constants, used, str(table))
+        order = sorted(used, key=lambda variable: variable != "view_zenith")
+        return list(dict.fromkeys(used[variable] for variable in order))
+
+    read = read_table(table, chosen, sheet=sheet, wanted=[*given.values(), *ignored])
+    source, lines = read.source, read.lines
+    values = {variable: read.columns[column] for variable, column in used.items()}
+    if angle is not None:
+        places = [f"{source}: line {line}, column {angle}" for line in lines]
+        values["view_zenith"] = values["light_zenith"] = as_incidence(
+            read.columns[angle], angle_is, places
+        )
+    values |= {variable: np.full(len(lines), float(x)) for variable, x in constants.items()}
+    values |= _stated_errors(read, used, values)
+    notes = [*read.notes, *_mask_blanks(values, used, read)]
+    _check_values(values, used, lines, source)
+    if "aolp" in values:
+        values |= _normalized_stokes(values, AXES[aolp_from], source)
+        notes.append(f"q and u follow from dop and aolp, which counts from {aolp_from}")
+    capture = _of_materials(values, saturation_level, source)
     capture = capture.assign_attrs(
         source=Path(source).name, name=name or Path(source).stem, angle_set_by=angle_set_by
     )
     if setup is not None:
         capture.attrs["setup"] = setup
+    if notes:
+        capture.attrs["import_notes"] = "; ".join(notes)
     return validate(capture, source=source)
 
 
 # --- Columns --------------------------------------------------------------------------------------
+
+
+def _check_options(angle: str | None, angle_is: str | None, aolp_from: str) -> None:
+    if aolp_from not in AXES:
+        raise CaptureError(f"it is {aolp_from!r}", where="aolp_from", hint="give s or p")
+    if angle is None and angle_is is not None:
+        hint = "name the column by angle="
+        raise CaptureError("the angle of a mirror is not named", where="angle_is", hint=hint)
 
 
 def _columns(
@@ -109,10 +148,13 @@ def _columns(
 ) -> dict[str, str]:
     """The column of each variable; every column is used or ignored."""
     for column in (*columns.values(), *ignored):
-        _check_column(column, names, source)
+        check_column(column, names, source)
     for variable, column in columns.items():
         _check_name(variable, f"{source}: column {column}")
     used = dict(columns)
+    if any(MUELLER.fullmatch(name) for name in names if name not in (*columns.values(), *ignored)):
+        hint = "import it by pb.from_ellipsometer(mueller='column') if the light was unpolarized"
+        raise CaptureError("it holds elements of Mueller matrices", where=source, hint=hint)
     for column in (name for name in names if name not in (*columns.values(), *ignored)):
         where = f"{source}: column {column}"
         _check_name(column, where)
@@ -121,12 +163,6 @@ def _columns(
             raise CaptureError(what, where=where, hint="ignore one of both")
         used[column] = column
     return used
-
-
-def _check_column(column: str, names: Sequence[str], source: str) -> None:
-    if column not in names:
-        hint = f"choose from {', '.join(names)}"
-        raise CaptureError(f"there is no column {column!r}", where=source, hint=hint)
 
 
 def _check_constants(
@@ -153,6 +189,56 @@ def _check_name(variable: str, where: str) -> None:
         raise CaptureError(f"a capture has no variable {variable!r}", where=where, hint=hint)
 
 
+def _stated_errors(
+    read: Table, columns: Mapping[str, str], values: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Errors that cells state behind their readings, of variables that have no others."""
+    found = {}
+    for variable, column in columns.items():
+        name, error = f"{variable}_error", read.errors[column]
+        stated = np.isfinite(error)
+        if name not in KNOWN or name in values or not stated.any():
+            continue
+        if (missing := ~stated & np.isfinite(values[variable])).any():
+            what = f"it states no uncertainty, which {counted(int(stated.sum()), 'other')} do"
+            where = f"{read.source}: line {read.lines[int(np.argmax(missing))]}, column {column}"
+            raise CaptureError(what, where=where, hint="state that of every reading, or of none")
+        found[name] = error
+    return found
+
+
+def _mask_blanks(
+    values: dict[str, np.ndarray], columns: Mapping[str, str], read: Table
+) -> list[str]:
+    """Mark lines in which a reading is blank as not valid; refuse other blanks."""
+    blank = np.zeros(len(read.lines), bool)
+    for variable, column in columns.items():
+        missing = np.isnan(values[variable])
+        if variable in KNOWN and KNOWN[variable].kind == "reading":
+            blank |= missing
+        elif missing.any() and not variable.startswith("true_"):
+            where = f"{read.source}: line {read.lines[int(np.argmax(missing))]}, column {column}"
+            hint = "fill it in, or take the line out (a # before it makes it a comment)"
+            raise CaptureError(f"{variable} is blank", where=where, hint=hint)
+    if not blank.any():
+        return []
+    values["valid"] = np.where(blank, 0.0, values.get("valid", 1.0))
+    return [f"{counted(int(blank.sum()), 'line', 'with a blank reading')} masked"]
+
+
+def _normalized_stokes(
+    values: dict[str, np.ndarray], axis: float, source: str
+) -> dict[str, np.ndarray]:
+    """Stokes q and u from degree and angle of polarization, with the error of the degree."""
+    if "dop" not in values or "q" in values:
+        hint = "give dop and aolp, or q and u"
+        raise CaptureError("aolp makes q and u of dop alone", where=source, hint=hint)
+    twice = np.deg2rad(2.0 * (values.pop("aolp") + axis))
+    found = {"q": values["dop"] * np.cos(twice), "u": values["dop"] * np.sin(twice)}
+    errors = ("q_error", "u_error") if "dop_error" in values else ()
+    return found | {name: values["dop_error"] for name in errors}
+
+
 def _check_values(
     values: Mapping[str, np.ndarray], columns: Mapping[str, str], lines: Sequence[int], source: str
 ) -> None:
@@ -169,10 +255,33 @@ def _check_values(
             raise CaptureError(what, where=where, hint=hint_for(row, numbers[wrong]))
 
 
-# --- Lines of one material ------------------------------------------------------------------------
+# --- Materials, and the lines of each -------------------------------------------------------------
 
 
-def _capture(values: dict[str, np.ndarray], saturation_level: float | None) -> xr.Dataset:
+def _of_materials(
+    values: dict[str, np.ndarray], saturation_level: float | None, source: str
+) -> xr.Dataset:
+    leading = [dim for dim in DIMS if dim in values]
+    if len(leading) > 1:
+        hint = "ignore one of both"
+        raise CaptureError("it has materials and patches", where=source, hint=hint)
+    if leading:
+        labels = values.pop(leading[0])
+        parts = {
+            # All digits: two numbers never have one label. Adding zero turns -0.0 into 0.0.
+            repr(float(label) + 0.0).removesuffix(".0"): capture_of_lines(
+                {name: x[labels == label] for name, x in values.items()}, saturation_level
+            )
+            for label in np.unique(labels)
+        }
+        return combine(parts, dim=leading[0])
+    return capture_of_lines(values, saturation_level)
+
+
+def capture_of_lines(
+    values: dict[str, np.ndarray], saturation_level: float | None = None
+) -> xr.Dataset:
+    """The capture of lines of one material; those of several wavelengths are views by direction."""
     values = dict(values)
     waves = values.pop("wavelength", None)
     if waves is None or len(np.unique(waves)) == 1:
@@ -208,147 +317,3 @@ def _views(values: dict[str, np.ndarray], column: np.ndarray) -> np.ndarray:
     lines = pd.DataFrame({**directions, "column": column})
     lines["repetition"] = lines.groupby([*lines], sort=False).cumcount()
     return lines.groupby([*directions, "repetition"], sort=False).ngroup().to_numpy()
-
-
-# --- Text tables of numbers, as detectors and spreadsheets write them -----------------------------
-
-LARGEST_FILE = 50_000_000  # bytes
-BLANKS = re.compile(r"[ \t]+")
-# A decimal comma is between digits, so the comma of "10, 5" separates.
-NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*|,[0-9]+)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?")
-EACH_READING = "give a line for each reading"
-
-Row = tuple[int, list[str]]  # line of the file, cells
-
-
-@dataclasses.dataclass(frozen=True)
-class Table:
-    """Columns of numbers, with their lines and the value of each last printed digit."""
-
-    source: str
-    columns: Mapping[str, np.ndarray]
-    steps: Mapping[str, np.ndarray]
-    lines: tuple[int, ...]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the columns; without a header line column_1, column_2, ..."""
-        return tuple(self.columns)
-
-
-def read_table(path: str | os.PathLike[str], columns: Sequence[str] | None = None) -> Table:
-    """A text table of numbers, by default with all its columns."""
-    names, rows = _read_cells(path)
-    return _as_numbers(str(path), names, rows, columns or names)
-
-
-def _as_numbers(source: str, names: list[str], rows: list[Row], columns: Collection[str]) -> Table:
-    """Some columns of a table of text."""
-    if not rows:
-        raise CaptureError("it holds names but no rows", where=source, hint=EACH_READING)
-    has_points = any("." in cell for _, cells in rows for cell in cells)
-    for line, cells in rows:
-        where = f"{source}: line {line}"
-        if len(cells) != len(names):
-            what = f"it has another number of cells ({len(cells)}) than the first ({len(names)})"
-            raise CaptureError(what, where=where, hint="give every line one cell for each column")
-        if has_points and any("," in cell for cell in cells):  # "1,234" could be 1.234 or 1234
-            what = "decimal commas stand beside decimal points"
-            hint = "use one of them, and no mark for thousands"
-            raise CaptureError(what, where=where, hint=hint)
-    values, steps = {}, {}
-    for name in columns:
-        _check_column(name, names, source)
-        k = names.index(name)
-        pairs = [_number(cells[k], f"{source}: line {line}, column {name}") for line, cells in rows]
-        values[name], steps[name] = np.array(pairs).T
-    return Table(source, values, steps, tuple(line for line, _ in rows))
-
-
-def _read_cells(path: str | os.PathLike[str]) -> tuple[list[str], list[Row]]:
-    """Names of the columns of a text table, and the rows below them."""
-    # Semicolons, tabs, commas or blanks separate the cells; runs of tabs or of blanks separate
-    # once. The first line may name the columns. From a # to the end of its line is comment. Where
-    # commas do not separate they may be decimal commas, in the whole table or not at all.
-    file = existing_file(path, "table")
-    lines = []
-    for number, line in enumerate(re.split("\r\n|\r|\n", _text(file)), 1):
-        if content := line.partition("#")[0].strip():
-            lines.append((number, content))
-    if not lines:
-        raise CaptureError("it holds no rows", where=str(file), hint=EACH_READING)
-    # The second line holds numbers, whether or not the first one holds names.
-    separator = _separator(lines[min(1, len(lines) - 1)][1])
-    rows = [(number, [_unquoted(x) for x in separator.split(line)]) for number, line in lines]
-    return _take_header(rows, str(file))
-
-
-def _text(file: Path) -> str:
-    try:
-        if file.stat().st_size > LARGEST_FILE:
-            hint = "give a table of at most 50 MB"
-            raise CaptureError("the file is too large", where=str(file), hint=hint)
-        content = file.read_bytes()
-    except OSError as error:
-        raise system_error(error, file) from error
-    if b"\0" in content:
-        raise CaptureError("it is not text", where=str(file), hint="save the table as UTF-8 text")
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:  # such as a degree sign in an old header; digits are ASCII anyway
-        return content.decode("latin-1")
-
-
-def _separator(line: str) -> re.Pattern[str]:
-    if ";" in line:
-        return re.compile(";")
-    if "\t" in line:
-        return re.compile(r"\t+")
-    cells = BLANKS.split(line)
-    decimal_commas = len(cells) > 1 and all(map(_is_number, cells))
-    return re.compile(",") if "," in line and not decimal_commas else BLANKS
-
-
-def _unquoted(cell: str) -> str:
-    cell = cell.strip()
-    quoted = len(cell) > 1 and cell[0] == cell[-1] == '"'
-    return cell[1:-1].strip() if quoted else cell
-
-
-def _take_header(rows: list[Row], source: str) -> tuple[list[str], list[Row]]:
-    """Names of the columns and the rows below them."""
-    line, first = rows[0]
-    if not all(map(_is_name, filter(None, first))):
-        return [f"column_{k}" for k in range(1, len(first) + 1)], rows
-    names = [name or f"column_{k}" for k, name in enumerate(first, 1)]
-    where = f"{source}: line {line}"
-    if len(set(names)) != len(names):
-        hint = "name each column once"
-        raise CaptureError("two columns have the same name", where=where, hint=hint)
-    if not all(name.isprintable() for name in names):
-        hint = "save the table as UTF-8 text"
-        raise CaptureError("a name is not printable text", where=where, hint=hint)
-    return names, rows[1:]
-
-
-def _is_name(cell: str) -> bool:
-    """Whether a cell is a name rather than a mistyped number, which must not be lost."""
-    lettered = any(character.isalpha() for character in cell)
-    is_missing = cell.lower() in ("nan", "inf", "infinity", "na", "n/a", "none", "null")
-    return lettered and cell[0] not in "0123456789+-.," and not is_missing
-
-
-def _is_number(cell: str) -> bool:
-    return len(cell) <= 64 and NUMBER.fullmatch(cell) is not None
-
-
-def _number(cell: str, where: str) -> tuple[float, float]:
-    """Value of a cell, and of its last printed digit."""
-    if _is_number(cell):
-        digits = cell.replace(",", ".")
-        value = float(digits)
-        step = float(f"1e{Decimal(digits).as_tuple().exponent}")
-        if math.isfinite(value) and 0.0 < step < math.inf:
-            return value, step
-    hint = "correct it, or take the line out (a # before it makes it a comment)"
-    raise CaptureError(f"{cell!r} is not a finite number", where=where, hint=hint)

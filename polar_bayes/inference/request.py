@@ -23,6 +23,7 @@ from polar_bayes.numerics.fingerprint import uses_own_code
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.surface import SmoothSurface
 from polar_bayes.priors import (
     PRIORS,
     NormalCoordinate,
@@ -34,6 +35,7 @@ from polar_bayes.priors import (
 from polar_bayes.setups import (
     SETUPS,
     Setup,
+    as_read,
     default_priors,
     find_setup,
     priors_known_to,
@@ -148,6 +150,7 @@ def resolve(
         chosen_by = "capture" if "setup" in capture.attrs else "default"
         scene = str(capture.attrs.get("setup", "polarimeter"))
     setup, scene_name = _find_scene(scene, capture)
+    setup = as_read(setup, capture)
     if not is_perfect:
         acting = (each for each in setup.known if all(name in capture for name in each.needs))
         setup = dataclasses.replace(setup, scene=setup.scene.known_to(acting))
@@ -301,12 +304,15 @@ def _choose_links(
         )
     for name, link in chosen.items():
         _check_link(name, link, capture)
-    if not any(name in chosen for name in ("dop", "q", "u")):
+    # How bright a mirror is at each angle tells its index, also where the exposure is not known.
+    is_mirror = isinstance(setup.scene.surface, SmoothSurface)
+    if not {"dop", "q", "u", *(("intensity",) if is_mirror else ())} & set(chosen):
         raise CaptureError(
             f"no polarization that these links describe (wanted {' or '.join(wanted)})",
             where=str(capture.attrs.get("name", "capture")),
             hint="links name every variable that is fitted: add BetaLink for dop, StokesLink for "
-            "q and u, or choose another scene",
+            "q and u, or choose another scene; of a mirror the intensity alone will do, by "
+            "scene='goniometer'",
         )
     return chosen
 

@@ -135,6 +135,15 @@ def scale_by_confidence(scale: Array, confidence: PerView | None) -> Array:
     return scale if confidence is None else scale / jnp.sqrt(confidence)
 
 
+def stated_errors(link: object, name: str, data: Observations) -> PerView:
+    """The errors that a capture states of a reading, refused where it states none."""
+    if name not in data.errors:
+        what = f"the capture states no {name}_error"
+        hint = "add that variable to the capture or use stated_errors=False"
+        raise FitError(what, where=f"{type(link).__name__}(stated_errors=True)", hint=hint)
+    return data.errors[name]
+
+
 def _check_range(owner: object, field: str, low: float, high: float, note: str = "") -> None:
     value = getattr(owner, field)
     if not low <= value <= high:
@@ -331,11 +340,8 @@ class StokesLink(AbstractLink):
         self, name: str, prediction: Prediction, data: Observations, noise: Noise
     ) -> dist.Distribution:
         if self.stated_errors:
-            if name not in data.errors:
-                what = f"the capture states no {name}_error"
-                hint = "add that variable to the capture or use stated_errors=False"
-                raise FitError(what, where="StokesLink(stated_errors=True)", hint=hint)
-            location, scale = prediction[name], noise["stokes_error_factor"] * data.errors[name]
+            errors = stated_errors(self, name, data)
+            location, scale = prediction[name], noise["stokes_error_factor"] * errors
         else:
             light = self._brightness(prediction, data, noise)
             square = noise["stokes_scale"] ** 2
@@ -374,18 +380,30 @@ class StudentTLink(AbstractLink):
     Args:
         degrees_of_freedom: $\nu$, unit 1, range [3, 7].
         schedule: How $\sigma$ depends on brightness and angle.
+        stated_errors: True where $\sigma$ is `stokes_error_factor` times the error that the capture
+            states of each reading, in place of the schedule.
 
     Source:
         The paper, section 2; the stops of the sensor are ours.
     """
 
     observables: ClassVar[tuple[str, ...]] = ("intensity",)
-    parameters: ClassVar[tuple[str, ...]] = ("exposure", "intensity_scale")
     degrees_of_freedom: float = 5.0
     schedule: ScaleSchedule = dataclasses.field(default_factory=ScaleSchedule)
+    stated_errors: bool = False
 
     def __post_init__(self) -> None:
         _check_range(self, "degrees_of_freedom", 3.0, 7.0, ", the paper's range of nu")
+
+    @property
+    @override
+    def parameters(self) -> tuple[str, ...]:  # type: ignore[override]
+        return ("exposure", "stokes_error_factor" if self.stated_errors else "intensity_scale")
+
+    @property
+    @override
+    def reads_errors(self) -> bool:
+        return self.stated_errors
 
     @override
     def center(self, name: str, prediction: Prediction, noise: Noise) -> PerView:
@@ -397,7 +415,10 @@ class StudentTLink(AbstractLink):
     ) -> dist.Distribution:
         location = self.center(name, prediction, noise)
         cos_view = cos_degrees(data.geometry.view_zenith)
-        scale = self.schedule.scale(noise["intensity_scale"], location, cos_view)
+        if self.stated_errors:
+            scale = noise["stokes_error_factor"] * stated_errors(self, name, data)
+        else:
+            scale = self.schedule.scale(noise["intensity_scale"], location, cos_view)
         scale = scale_by_confidence(scale, data.confidence)
         return SensorStudentT(
             self.degrees_of_freedom, location, scale, data.saturated, data.full_scale

@@ -213,7 +213,7 @@ NOTATION: dict[str, Quantity] = {
     "logit_scale": Quantity("", "noise of the log odds of dop"),
     "normal_scale": Quantity("", "noise of the readings"),
     "stokes_scale": Quantity("", "noise of q and u in full light"),
-    "stokes_error_factor": Quantity("", "true over stated errors of q and u"),
+    "stokes_error_factor": Quantity("", "true over stated errors of the Stokes parameters"),
     "exposure": Quantity("", "recorded over predicted intensity"),
     "intensity_scale": Quantity("", "noise of the intensity"),
 }

@@ -15,6 +15,8 @@ Source:
 
 import contextlib
 import dataclasses
+import functools
+import math
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping
@@ -38,6 +40,7 @@ from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import CENTRAL_95, bounds_of
 from polar_bayes.methods.importance import Importance
+from polar_bayes.numerics.compile import OutOfTimeError, run_until
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import parse_prior, support_bounds
@@ -61,6 +64,9 @@ MAX_FITS = 12
 
 MAX_ALTERNATIVES = 4
 """Alternatives that are fitted besides at most: those with other slopes or bodies come first."""
+
+TIME_WAS_UP = "the time was up"
+"""Why a scene was not fitted within the seconds of a comparison."""
 
 LEAST_WEIGHT = 0.05
 """Stacking weight below which a scene does not remain."""
@@ -110,6 +116,7 @@ def compare_scenes(
     largest_view_zenith: float | None = None,
     seed: int = 0,
     precision: str = "double",
+    seconds: float | None = None,
     progress: Progress | None = None,
 ) -> SceneComparison:
     """Compare scenes for one capture, from simple to complex.
@@ -129,6 +136,8 @@ def compare_scenes(
         largest_view_zenith: As for `polar_bayes.fit`.
         seed: As for `polar_bayes.fit`.
         precision: As for `polar_bayes.fit`.
+        seconds: Wall time of the comparison, > 0; by default as long as it takes. Only the first
+            scene is always fitted; what is not done by then is left out, and named.
         progress: Called with the name of a stage and the fraction of it that is done.
 
     Returns:
@@ -144,8 +153,9 @@ def compare_scenes(
         al. (2018), Bayesian Analysis 13, 917 (stacking).
     """
     arguments = FitArguments(
-        validate(capture), model, priors, links, largest_view_zenith, seed, precision
-    )
+        validate(capture), model, priors, links, largest_view_zenith, seed, precision,
+        seconds=seconds,
+    )  # fmt: skip
     if scenes is None:
         return compare_candidates(arguments, progress or no_progress)
     fits = _Fits(arguments.among(_checked(scenes).values()), progress or no_progress)
@@ -197,6 +207,19 @@ class FitArguments:
     known: Mapping[str, float] | None = None
     scene_parameters: frozenset[str] = frozenset()
     """Parameters that any of the scenes reads."""
+    seconds: float | None = None
+    """Wall time of the comparison; None: as long as it takes."""
+    begun: float = dataclasses.field(default_factory=time.perf_counter)
+
+    def __post_init__(self) -> None:
+        if self.seconds is not None and not self.seconds > 0.0:
+            hint = "give a time above 0, such as 60"
+            raise FitError(f"seconds is {self.seconds}", where="compare_scenes", hint=hint)
+
+    @property
+    def deadline(self) -> float:
+        """When the comparison ends, by `time.perf_counter`."""
+        return math.inf if self.seconds is None else self.begun + self.seconds
 
     @property
     def chosen_links(self) -> AbstractLink | Mapping[str, AbstractLink] | None:
@@ -255,37 +278,48 @@ class _Fits:
         """Fit candidates, of which at most so many are tried in all."""
         requests = {name: self.arguments.request(scene) for name, scene in scenes.items()}
         waiting = list(requests.values())
-        for number, (name, request) in enumerate(requests.items()):
-            self.progress(f"comparing scenes: {name}", self.count / most)
-            for each in waiting[number : number + 2]:
-                _begin_to_compile(each)  # the next one while this one runs
-            self._add(name, request)
+        for number, name in enumerate(requests):
+            if self.done and time.perf_counter() >= self.arguments.deadline:
+                self.failed[name] = TIME_WAS_UP
+                continue
+            stage = f"comparing scenes: {name} ({self.count + 1} of at most {most})"
+            share, deadline = self.count / most, self.arguments.deadline if self.done else math.inf
+            self.progress(stage, share)
+            work = functools.partial(_fitted, name, waiting[number : number + 2], stage, share)
+            try:
+                self.done[name] = run_until(deadline, self.progress, work)
+            except (FitError, np.linalg.LinAlgError) as error:
+                self.failed[name] = one_line(str(error))
+            except OutOfTimeError:
+                self.failed[name] = TIME_WAS_UP
 
-    def _add(self, name: str, request: Request) -> None:
-        begun = time.perf_counter()
-        try:
-            tree = fit_request(request, METHOD, no_progress, begun, with_comparisons=False)
-            view = view_of(tree)
-            checks = predictive_checks(view)
-            loo = [check.loo for check in checks.values() if check.loo is not None]
-            if not loo or len(loo) < len(checks):
-                raise FitError(
-                    "its draws do not predict the readings", where=name, hint="fit it alone"
-                )
-            levels = criticize(view)["level"]
-            findings = levels[levels.isin(["caution", "problem"])]
-        except (FitError, np.linalg.LinAlgError) as error:
-            self.failed[name] = one_line(str(error))
-            return
-        self.done[name] = _Fit(
-            view,
-            request,
-            seconds=time.perf_counter() - begun,
-            findings=findings,
-            pointwise=np.concatenate([each.pointwise for each in loo]),
-            unreliable=sum(each.unreliable for each in loo),
-            index_bound=_index_bound(view) if "bounds" in findings.index else float("nan"),
-        )
+
+def _fitted(name: str, requests: list[Request], stage: str, share: float, report: Progress) -> _Fit:
+    """The fit of the first request, with its predictions and criticism."""
+    for each in requests:
+        _begin_to_compile(each)  # the next one while this one runs
+    begun, request = time.perf_counter(), requests[0]
+
+    def progress(*_: object) -> None:  # where a thread that was abandoned ends
+        report(stage, share)
+
+    tree = fit_request(request, METHOD, progress, begun, with_comparisons=False)
+    view = view_of(tree)
+    checks = predictive_checks(view)
+    loo = [check.loo for check in checks.values() if check.loo is not None]
+    if not loo or len(loo) < len(checks):
+        raise FitError("its draws do not predict the readings", where=name, hint="fit it alone")
+    levels = criticize(view)["level"]
+    findings = levels[levels.isin(["caution", "problem"])]
+    return _Fit(
+        view,
+        request,
+        seconds=time.perf_counter() - begun,
+        findings=findings,
+        pointwise=np.concatenate([each.pointwise for each in loo]),
+        unreliable=sum(each.unreliable for each in loo),
+        index_bound=_index_bound(view) if "bounds" in findings.index else float("nan"),
+    )
 
 
 def _index_bound(fit: FitView) -> float:

@@ -48,6 +48,7 @@ def fit(
             standard deviations, above 0 and at most 1; by default 0.1.
         seconds: Of "auto": wall time of the whole fit, by default 60. Only the first method always
             ends; what is not done by then is abandoned, and the best answer so far is returned.
+            Also of scene="auto", with any method: of the comparison of scenes.
         scene: A name in `SETUPS` or a `Scene`; by default the set-up that the capture names in
             its attribute `setup`, else "polarimeter". "auto" compares scenes, as
             `polar_bayes.compare_scenes` does, and stacks the posteriors of those that remain.
@@ -80,11 +81,14 @@ def fit(
         FitError: A model, method, prior or link cannot be used, or the memory is too small.
     """
     start_time = time.perf_counter()
-    chosen, show = choose_method(method, tolerance, seconds), progress or no_progress
-    if isinstance(scene, str) and scene == "auto":
+    is_search, show = isinstance(scene, str) and scene == "auto", progress or no_progress
+    of_method = None if is_search and method != "auto" else seconds
+    chosen = choose_method(method, tolerance, of_method)
+    if is_search:
         arguments = polar_bayes.scenes.stacking.FitArguments(
-            validate(capture), model, priors, links, largest_view_zenith, seed, precision, known
-        )
+            validate(capture), model, priors, links, largest_view_zenith, seed, precision,
+            known=known, seconds=seconds,
+        )  # fmt: skip
         return polar_bayes.scenes.stacking.fit_best_scenes(arguments, chosen, show, keep)
     limit = largest_view_zenith
     request = resolve(capture, model, scene, priors, links, limit, seed, precision, known=known)

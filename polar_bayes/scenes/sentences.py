@@ -156,8 +156,10 @@ def scene_sentences(result: xr.DataTree | SceneComparison) -> list[str]:
             f"Criticism of {chosen} is left: {unexplained}; no candidate explains it, so the scene "
             "may lack a part that the library does not have."
         )
-    for name, why in json.loads(str(found.attrs.get("left_out", "{}"))).items():
-        sentences.append(f"{name} could not be fitted: {why}.")
+    left_out = json.loads(str(found.attrs.get("left_out", "{}")))
+    for why in dict.fromkeys(left_out.values()):
+        names = ", ".join(name for name, reason in left_out.items() if reason == why)
+        sentences.append(f"{names} could not be fitted: {why}.")
     return sentences
 
 

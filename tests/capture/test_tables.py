@@ -7,8 +7,8 @@ import pytest
 from cases import each
 
 from polar_bayes.errors import CaptureError
-from polar_bayes.importers import table as module
-from polar_bayes.importers.table import read_table
+from polar_bayes.importers import columns as module
+from polar_bayes.importers.columns import read_table
 
 
 @pytest.fixture
@@ -40,6 +40,14 @@ SAME_TABLE = {
     "carriage returns": "angle,level\r\n10,1.5\r\n20,2.5\r\n",
     "old carriage returns": "angle,level\r10,1.5\r20,2.5",
     "exponents": "angle,level\n1e1,15E-1\n+2.0e+1,.25e1\n",
+    "Fortran exponents": "angle level\n1.0D+01 15d-1\n0.20D2 .25D1\n",
+    "UTF-16": "angle\tlevel\r\n10\t1.5\r\n20\t2.5\r\n".encode("utf-16"),
+    "units": "angle,level\n(°),mV\n10,1.5\n20,2.5\n",
+    "text above": "Instrument: XY 3\nDate;7.3.2020;late\nangle;level\n10;1.5\n20;2.5\n",
+    "names in a comment": "# 3 lamps\n# angle level\n10 1.5\n20 2.5\n",
+    "names again": "angle,level\n10,1.5\nangle,level\n20,2.5\n",
+    "blank lines and means": "angle;level\n10;1.5\n20;2.5\n;;\n;mean;2\nmean;2\n",
+    "blanks at the end": "angle,level,,\n10,1.5,,\n20,2.5\n",
     "no last line break": "angle,level\n10,1.5\n20,2.5",
 }
 
@@ -56,6 +64,39 @@ def test_every_form_of_a_table_is_read_alike(write, form):
 def test_columns_without_names_are_numbered(write):
     assert read_table(write("1 2 3\n")).names == ("column_1", "column_2", "column_3")
     assert read_table(write("a,,c\n1,2,3\n")).names == ("a", "column_2", "c")
+
+
+MARKED = {
+    "1,234.5": ["1,234.5", "0.5"],
+    "1.234,5": ["1.234,5", "0,5"],
+    "1 234,5": ["1\N{NO-BREAK SPACE}234,5", "0,5"],
+    "1'234.5": ["1'234.5", ".5"],
+    "quoted": ['"1,234"', '"480"'],
+}
+
+
+@each("form", MARKED)
+def test_marks_for_thousands_are_taken_off_and_counted(write, form):
+    first, second = MARKED[form]
+    separator = "," if form == "quoted" else ";"
+    table = read_table(write(f"a{separator}b\n1{separator}{first}\n2{separator}{second}\n"))
+    expected = [1234.0, 480.0] if form == "quoted" else [1234.5, 0.5]
+    assert table.columns["b"].tolist() == expected
+    assert table.notes == ("1 number freed of marks for thousands",)
+
+
+def test_a_blank_is_no_reading_and_an_uncertainty_is_an_error(write):
+    table = read_table(
+        write("a\tb\tc\n1\t\t47.1±2.0\n\N{MINUS SIGN}2\t4\t47.1(20)\n3\tn/a\t5 +/- .5\n")
+    )
+    assert table.columns["a"].tolist() == [1.0, -2.0, 3.0]
+    np.testing.assert_array_equal(table.columns["b"], [np.nan, 4.0, np.nan])
+    assert table.columns["c"].tolist() == [47.1, 47.1, 5.0]
+    np.testing.assert_allclose(table.errors["c"], [2.0, 2.0, 0.5])
+    assert table.notes == (
+        "2 blank cells of b taken as no reading",
+        "3 readings of c with its error in the cell",
+    )
 
 
 def test_columns_are_chosen_by_name_in_the_order_asked(write):
@@ -79,8 +120,7 @@ def test_a_header_of_another_time_is_read(write):
 
 REFUSED = [
     ("1 2\n3 x\n", "line 2, column column_2: 'x' is not a finite number", "correct it"),
-    ("a b\n1 nan\n", "line 2, column b: 'nan' is not a finite number", "correct it"),
-    ("nan nan\n1 2\n", "line 1, column column_1: 'nan' is not", "correct it"),
+    ("nan nan\n-- 2\n", "no line has a number for column_1", "give a line for each"),
     ("1 2\n3 inf\n", "line 2, column column_2: 'inf' is not", "correct it"),
     ("1 2\n3 1e999\n", "line 2, column column_2: '1e999' is not", "correct it"),
     ("1 2\n3 1e9999\n", "line 2, column column_2: '1e9999' is not", "correct it"),
@@ -89,20 +129,24 @@ REFUSED = [
     ("1 2\n3 1_0\n", "line 2, column column_2: '1_0' is not", "correct it"),
     ("1 2\n3 0x10\n", "line 2, column column_2: '0x10' is not", "correct it"),
     ("1 2\n3 ٣\n", "line 2, column column_2: '٣' is not", "correct it"),
-    ("1 2\n3 \N{MINUS SIGN}4\n", "line 2, column column_2: '\N{MINUS SIGN}4' is not", "correct it"),
+    ("1 2\n3 4(0)\n", "line 2, column column_2: '4(0)' is not", "correct it"),
+    ("1 2\n3 4±inf\n", "line 2, column column_2: '4±inf' is not", "correct it"),
     ("1 2\n3 __import__('os')\n", 'line 2, column column_2: "__import__', "correct it"),
     ("1 2\n3 " + "9" * 65 + "\n", "line 2, column column_2: '999", "correct it"),
     ("1O 20\n10 20\n", "line 1, column column_1: '1O' is not", "correct it"),
-    ("a,b\ndeg,V\n1,2\n", "line 2, column a: 'deg' is not", "a # before it"),
-    ("1,2,\n", "line 1, column column_3: '' is not", "correct it"),
+    ("a,b\ndeg,V2\n1,2\n", "line 2, column a: 'deg' is not", "a # before it"),
+    ("a,b\n1,2\nx2,3\n", "line 3, column a: 'x2' is not", "a # before it"),
     ("1 2\n\n3\n", "line 3: it has another number of cells (1) than the first (2)", "one cell for"),
     ("a b\n1 2 3\n", "line 2: it has another number of cells (3) than the first (2)", "one cell"),
     ("1;2,5\n3;4.5\n", "line 1: decimal commas stand beside decimal points", "no mark for thous"),
-    ("1;1,234.5\n", "line 1: decimal commas stand beside decimal points", "no mark for thousands"),
+    ("1;1,234.5\n2;1,5\n", "line 1: decimal commas stand beside", "no mark for thousands"),
+    ("1;1,234.5\n2;1.234,5\n", "line 1: decimal commas stand", "no mark for thousands"),
+    ("1;480\n2;1,009\n", "line 2: '1,009' could be a thousand, or have a decimal", "print all dec"),
     ("a a\n1 2\n", "line 1: two columns have the same name", "name each column once"),
     ("a \x1bb\n1 2\n", "line 1: a name is not printable text", "UTF-8"),
     (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "it is not text", "save the table as UTF-8 text"),
-    ("a b\n1 2\n".encode("utf-16"), "it is not text", "save the table as UTF-8 text"),
+    ("a b\n1 2\n".encode("utf-16-le"), "it is not text", "save the table as UTF-8 text"),
+    (b"PK\3\4 broken", "it cannot be read as .xlsx", "save the table as UTF-8 text"),
     ("", "the file is empty", "write it again"),
     ("# only\n\n", "it holds no rows", "give a line for each reading"),
     ("a b\n", "it holds names but no rows", "give a line for each reading"),

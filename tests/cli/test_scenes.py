@@ -1,12 +1,16 @@
 """The command that compares scenes: what it prints, and what it writes."""
 
+import contextlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from synthetic_results import make_result
 
 import polar_bayes as pb
-from polar_bayes.cli import main
+from polar_bayes.cli import fits, main
+from polar_bayes.progress import Progress
 from polar_bayes.scenes import comparison
 
 
@@ -15,6 +19,20 @@ def one_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     """The simplest scene alone: what the command does, not what it finds."""
     monkeypatch.setattr(comparison, "MAX_FITS", 1)
     monkeypatch.setattr(comparison, "MAX_ALTERNATIVES", 0)
+
+
+def test_a_report_says_what_it_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stages: list[str] = []
+
+    @contextlib.contextmanager
+    def shown() -> Iterator[Progress]:
+        yield lambda stage, _: stages.append(stage)
+
+    monkeypatch.setattr(fits, "stages", shown)
+    pb.save(make_result(), tmp_path / "fit.nc")
+    words = ["report", str(tmp_path / "fit.nc"), "--no-next-views", "--out", str(tmp_path / "page")]
+    assert main(words) == 0
+    assert stages == ["reading the result", "drawing the report"]
 
 
 def test_scenes_are_compared_and_what_remains_is_written(

@@ -44,7 +44,25 @@ def table(folder: Path) -> xr.Dataset:
     return pb.from_table(folder / "leaf.csv", constants=ANGLES)
 
 
-IMPORTERS = {"goniometer": goniometer, "polarizer": polarizer, "mosaic": mosaic, "table": table}
+def ellipsometer(folder: Path) -> xr.Dataset:
+    (folder / "e.csv").write_text("angle,psi,delta\n50,10,180\n60,6,0\n")
+    return pb.from_ellipsometer(folder / "e.csv", angle="angle", psi="psi", delta="delta")
+
+
+def one_channel(folder: Path) -> xr.Dataset:
+    del folder
+    return pb.from_goniometer(p=(np.arange(20.0, 81.0, 10.0), np.arange(1.0, 8.0)))
+
+
+def color(folder: Path) -> xr.Dataset:
+    del folder
+    return pb.from_mosaic(pictures.frames(FOUR)[0], **CAMERA, color=(610.0, 530.0, 460.0))
+
+
+IMPORTERS = {
+    "goniometer": goniometer, "polarizer": polarizer, "mosaic": mosaic, "table": table,
+    "ellipsometer": ellipsometer, "one channel": one_channel, "color": color,
+}  # fmt: skip
 
 
 @each("make", IMPORTERS.values(), ids=IMPORTERS)

@@ -42,6 +42,7 @@ LINKS = [
     ("u", StokesLink(degrees_of_freedom=4.0)),
     ("q", StokesLink(stated_errors=True)),
     ("intensity", StudentTLink()),
+    ("intensity", StudentTLink(stated_errors=True)),
 ]
 EVERY_LINK = each(("name", "link"), LINKS, ids=lambda part: repr(part)[:60])
 

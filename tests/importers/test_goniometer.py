@@ -246,16 +246,33 @@ def test_interpolation_between_readings_of_no_light_stays_finite():
     assert np.isfinite(capture["q_error"]).all()
 
 
+def test_a_reading_of_zero_is_as_uncertain_as_its_neighbors_scatter():
+    """A program that cuts off at zero prints a zero whose last digit says nothing of the noise."""
+    noise = 0.4 * np.random.default_rng(2).normal(size=ANGLES.size)
+    s, p = readings(full=100.0)
+    cut = np.maximum(p[1] + noise, 0.0).round(6)
+    cut[7] = 0.0  # at Brewster's angle
+    capture = from_goniometer(s, (ANGLES, cut))
+    at_zero = float(capture["q_error"][7] * 2.0 * capture["intensity"][7] / 2.0)
+    # The scatter of six neighbors around a parabola has three degrees of freedom.
+    assert 0.1 < at_zero < 1.5
+    assert "1 reading of p at zero or below given the scatter" in capture.attrs["import_notes"]
+    stated = from_goniometer(s, (ANGLES, cut), p_error=1e-3)
+    assert float(stated["q_error"][7]) < 1e-2 * float(capture["q_error"][7])
+
+
 # --- refusals ---------------------------------------------------------------------------------
 
 GOOD = ([40.0, 50.0], [2.0, 3.0])
 OPTIONS = [
-    ({"s": GOOD}, "goniometer: a channel is missing", "give s and p, each a table or a pair"),
-    ({}, "goniometer: a channel is missing", "give s and p"),
+    ({}, "goniometer: no channel is there", "give s and p, or one of s, p and unpolarized"),
+    ({"s": GOOD, "unpolarized": GOOD}, "unpolarized light is a channel alone", "give s and p, or"),
+    ({"s": GOOD, "p_error": 1.0}, "p_error: its channel is missing", "give p, or leave it out"),
+    ({"s": GOOD, "angle_is": "theta"}, "angle_is: it is 'theta'", "give one of incidence, from-s"),
     ({"s": GOOD, "p": GOOD, "angle": "a"}, "angle: a column is named without table", "give the ta"),
     ({"table": "t.csv", "s": "S", "p": "P"}, "t.csv: angle: its column is not named", "angle= the"),
     ({"table": "t.csv", "angle": "a", "s": GOOD, "p": "P"}, "t.csv: s: its column", "give s= the"),
-    ({"table": "t.csv", "angle": "a", "s": "S"}, "t.csv: p: its column is not", "give p= the name"),
+    ({"table": "t.csv", "angle": "a", "p": GOOD}, "t.csv: p: its column is", "give p= the name"),
     ({"table": "t.csv", "angle": "a", "s": "S", "p": "P"}, "t.csv: there is no such", "check the"),
     ({"s": "gone.txt", "p": GOOD}, "gone.txt: there is no such file", "check the path"),
     ({"s": GOOD, "p": GOOD, "s_incident": 9.0}, "one incident level is missing", "or neither"),
@@ -277,8 +294,13 @@ OPTIONS = [
     ({"s": ([1, 2], [1]), "p": GOOD}, "s: 2 angles and 1 readings", "one angle for each reading"),
     ({"s": ([], []), "p": GOOD}, "s: it holds|s: 0 angles", "one"),
     ({"s": ([40, 90], [1, 2]), "p": GOOD}, "s[row=1]: the angle is outside 0 <= value <", "surf"),
-    ({"s": GOOD, "p": ([-1, 50], [1, 2])}, "p[row=0]: the angle is outside", "the surface normal"),
-    ({"s": ([40, 50, 40], [1, 2, 3]), "p": GOOD}, "s[row=2]: s was read at this angle", "average"),
+    ({"s": GOOD, "p": ([-1, 50], [1, 2])}, "p[row=0]: the angle is outside", "'incidence' takes"),
+    ({"s": ([99, 20, 30], [9, 1, 2])}, "s[row=0]: the angle is outside", "angle_is='two-theta'"),
+    (
+        {"s": ([20, 99], [1, 9]), "angle_is": "from-surface"},
+        "s[row=1]: the angle",
+        "check angle_is",
+    ),
     ({"s": ([40, 50], [1, 1e31]), "p": GOOD}, "s[row=1]: the reading is too large", "below 1e+30"),
     ({"s": ([40, 50], [1, -9]), "p": GOOD}, "s[row=1]: the reading lies below the", "as s_err"),
     (

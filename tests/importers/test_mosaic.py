@@ -167,3 +167,106 @@ def test_without_the_library_the_way_to_it_is_told(monkeypatch):
         from_mosaic(np.ones(pictures.SHAPE), shape=FLAT, light=LAMP, detector=QUIET)
     monkeypatch.undo()
     assert importlib.import_module("polanalyser")
+
+
+# --- In color -------------------------------------------------------------------------------------
+
+COLORS = (610.0, 530.0, 460.0)
+BAYER = (("red", "green"), ("green", "blue"))
+LIGHT = {"red": 1.0, "green": 0.7, "blue": 0.4}
+
+
+def color_mosaic(frames, light=LIGHT):
+    """What a color sensor reads: squares of four polarizers behind a Bayer pattern."""
+    mono, found = mosaic(frames), np.zeros(frames[0].shape)
+    for row, column in np.ndindex(4, 4):
+        share = light[BAYER[row // 2][column // 2]]
+        found[row::4, column::4] = share * mono[row::4, column::4]
+    return found
+
+
+def test_a_color_mosaic_is_three_wavelengths():
+    """Each color with its own brightness and the same polarization, away from the edges."""
+    known = {"shape": FLAT, "light": LAMP, "detector": QUIET, "bin": 8, "window": 1}
+    filled = from_mosaic(color_mosaic(sloping()), color=COLORS, **known)
+    whole = from_polarizer(sloping(), FOUR, **known)
+    assert filled["q"].dims == ("y", "x", "view", "wavelength")
+    assert filled["wavelength"].values.tolist() == [460.0, 530.0, 610.0]
+    inside = {"y": slice(1, -1), "x": slice(1, -1)}
+    for name in ("q", "u"):
+        off = filled[name].isel(inside) - whole[name].isel(inside)
+        assert float(np.abs(off).max()) < 1e-3  # steps of a 65535th of the frame, of the blue
+    for center, share in zip(COLORS, LIGHT.values(), strict=True):
+        bright = filled["intensity"].sel(wavelength=center).isel(inside)
+        np.testing.assert_allclose(bright, share * whole["intensity"].isel(inside), rtol=1e-3)
+    assert filled.attrs["masked_saturated"] == 0
+    known["bin"] = 6
+    with pytest.raises(CaptureError, match="it is 6; give a multiple of 4"):
+        from_mosaic(color_mosaic(sloping()), color=COLORS, **known)
+
+
+@pytest.mark.thorough
+def test_the_noise_of_each_color_is_the_stated_one():
+    """Scores of q over a frame of even light, as of a monochrome mosaic above."""
+    shape, passed = (64 * 4, 64 * 4), np.array([300.0, 220.0, 100.0, 180.0])
+    clean = color_mosaic(np.broadcast_to(passed[:, None, None], (4, *shape)))
+    noise = np.random.default_rng(1).normal(size=shape)
+    detector = pb.importers.Detector(
+        saturation_level=FULL, read_noise=3.0, gain=0.2, relative_error=0.0
+    )
+    capture = from_mosaic(
+        clean + np.sqrt(9.0 + 0.2 * clean) * noise, shape=np.broadcast_to(FLAT[0, 0], (*shape, 3)),
+        light=LAMP, color=COLORS, detector=detector, window=1,
+    ).isel(y=slice(2, -2), x=slice(2, -2))  # fmt: skip
+    for center in COLORS:
+        color = capture.sel(wavelength=center)
+        score = (color["q"] - color["q"].mean()) / color["q_error"]
+        # Blue and red share their noise with the next blocks, so fewer are independent.
+        assert float((score**2).mean()) == pytest.approx(1.0, abs=0.2)
+
+
+@each(
+    ("asked", "said"),
+    [
+        ({"color": (460, 530, 610)}, "color: it is (460, 530, 610); give the centers of red"),
+        ({"color": (610, 530)}, "color: it is (610, 530)"),
+        ({"color": COLORS, "wavelength": 550.0}, "a color mosaic has no one wavelength"),
+    ],
+)
+def test_a_mistake_of_colors_is_told(asked, said):
+    with pytest.raises(CaptureError, match=re.escape(said)):
+        from_mosaic(np.ones(pictures.SHAPE), shape=FLAT, light=LAMP, detector=QUIET, **asked)
+
+
+# --- How counts are kept --------------------------------------------------------------------------
+
+
+def test_bits_aligned_to_the_left_are_read_at_their_own_full_count():
+    raw = np.rint(mosaic(sloping()))
+    known = {"shape": FLAT, "light": LAMP, "window": 1}
+    plain = from_mosaic(raw, detector=pb.importers.Detector(saturation_level=4095.0), **known)
+    left = (16.0 * raw).astype(np.uint16)
+    for level in (4095.0, 65535.0):
+        with pytest.raises(CaptureError, match=r"multiples of 16: 12 bits .*level=65520"):
+            from_mosaic(left, detector=pb.importers.Detector(saturation_level=level), **known)
+    scaled = pb.importers.Detector(saturation_level=16.0 * 4095.0, read_noise=16.0)
+    found = from_mosaic(left, detector=scaled, **known)
+    np.testing.assert_allclose(found["q"], plain["q"], atol=1e-4)
+    np.testing.assert_allclose(found["q_error"], plain["q_error"], rtol=1e-3)
+
+
+def test_shares_of_full_light_need_their_noise():
+    raw = mosaic(sloping()) / FULL
+    known = {"shape": FLAT, "light": LAMP, "window": 1}
+    with pytest.raises(CaptureError, match="1 for shares of full light"):
+        from_mosaic(raw, **known)
+    with pytest.raises(CaptureError, match="read_noise: it is 1, and a pixel is full at 1; give"):
+        from_mosaic(raw, detector=pb.importers.Detector(saturation_level=1.0), **known)
+    detector = pb.importers.Detector(saturation_level=1.0, read_noise=1.0 / FULL)
+    assert from_mosaic(raw, detector=detector, **known)["valid"].all()
+
+
+def test_a_packed_file_is_refused_by_the_way_to_unpack_it(tmp_path):
+    (tmp_path / "frame.raw").write_bytes(bytes(range(96)))
+    with pytest.raises(CaptureError, match=r"a raw file does not say how .* unpack it with NumPy"):
+        from_mosaic(tmp_path / "frame.raw", shape=FLAT, light=LAMP)

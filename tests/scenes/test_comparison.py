@@ -33,6 +33,20 @@ def comparison(capture: xr.Dataset) -> SceneComparison:
     return pb.compare_scenes(capture, SCENES, links=LINKS)
 
 
+def test_a_comparison_ends_when_its_time_is_up(capture: xr.Dataset) -> None:
+    """The first scene is fitted whatever the time; the others are named."""
+    stages: dict[str, float] = {}
+    found = pb.compare_scenes(
+        capture, SCENES, links=LINKS, seconds=1e-3, progress=lambda *each: stages.update([each])
+    )
+    assert list(found.table.index) == ["mirror"]
+    assert found.left_out == {"with body": "the time was up"}
+    assert "with body could not be fitted: the time was up." in pb.scenes.scene_sentences(found)
+    assert next(iter(stages)) == "comparing scenes: mirror (1 of at most 2)"
+    with pytest.raises(pb.FitError, match="seconds is 0; give a time above 0"):
+        pb.compare_scenes(capture, SCENES, links=LINKS, seconds=0)
+
+
 def test_the_scene_of_the_data_predicts_best(comparison: SceneComparison) -> None:
     assert comparison.table.index[0] == "with body"
     assert comparison.table["weight"].sum() == pytest.approx(1.0)
