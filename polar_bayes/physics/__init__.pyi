@@ -1,6 +1,7 @@
 from . import instrument as instrument
 from .coat import (
     AbstractCoat as AbstractCoat,
+    BackFace as BackFace,
     ClearCoat as ClearCoat,
     CoatStack as CoatStack,
     ThinFilm as ThinFilm,

@@ -1,7 +1,8 @@
 """Variants of a scene: without some of its effects, or with another part in the place of one.
 
 There is no list of effects or of alternatives: every part whose `simpler` or `alternatives` gives
-replacements has them, wherever it is in a scene and whoever wrote it.
+replacements has them, wherever it is in a scene and whoever wrote it. Layers that nobody sees, a
+clear film or the back of a plate, are alternatives to a place where a scene has nothing.
 """
 
 import dataclasses
@@ -10,8 +11,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 from polar_bayes.errors import SceneError
+from polar_bayes.physics.coat import BackFace, ClearCoat, ThinFilm
 from polar_bayes.physics.part import Part
 from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.subsurface import Unpolarized
+from polar_bayes.physics.surface import SmoothSurface
+
+CLEAR_FILM = ClearCoat(absorbance=0.0)
 
 KeyPath = tuple[str | int, ...]
 """Keys from a scene to a part: names of fields, and indices of tuples."""
@@ -19,11 +25,11 @@ KeyPath = tuple[str | int, ...]
 
 @dataclasses.dataclass(frozen=True)
 class Effect:
-    """One part of a scene, and one replacement, simpler or alternative."""
+    """One part of a scene, or a place without one, and one replacement, simpler or alternative."""
 
     name: str
     key_path: KeyPath
-    part: Part
+    part: Part | None
     replacement: Part | None
 
     @property
@@ -41,9 +47,23 @@ def effects_of(scene: Scene) -> tuple[Effect, ...]:
     return _replacements(scene, operator.methodcaller("simpler"))
 
 
-def alternatives_of(scene: Scene) -> tuple[Effect, ...]:
-    """Every part of a scene with one that could be there as well, in the order of its fields."""
-    return _replacements(scene, operator.methodcaller("alternatives"))
+def alternatives_of(scene: Scene, *, has_wavelength: bool = True) -> tuple[Effect, ...]:
+    """Every part of a scene with one that could be there as well, and layers that nobody sees."""
+    found = _replacements(scene, operator.methodcaller("alternatives"))
+    layers = _unseen_layers(scene, has_wavelength)
+    return (*found, *(Effect(type(part).__name__, key, None, part) for key, part in layers))
+
+
+def _unseen_layers(scene: Scene, has_wavelength: bool) -> Iterator[tuple[KeyPath, Part]]:
+    """Layers that a bare scene may have, each with its place."""
+    if scene.coat is None:
+        yield ("coat",), CLEAR_FILM
+        if has_wavelength:
+            yield ("coat",), ThinFilm()
+    # The body of a transparent plate scatters nothing; stray light may take its place.
+    is_transparent = isinstance(scene.subsurface, Unpolarized | None)
+    if isinstance(scene.surface, SmoothSurface) and scene.surface.back is None and is_transparent:
+        yield ("surface", "back"), BackFace()
 
 
 def _replacements(

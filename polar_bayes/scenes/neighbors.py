@@ -49,6 +49,9 @@ from polar_bayes.physics.variants import alternatives_of
 from polar_bayes.priors import resolve_priors
 from polar_bayes.progress import Progress
 
+NOTHING = "nothing"
+"""What stands in a place where an alternative adds a part."""
+
 STOPPED = "it was stopped before it was done"
 """Why a comparison is missing that somebody did not wait for."""
 
@@ -175,7 +178,9 @@ def compare_alternatives(
     already are left out. A `FitError` where all coordinates together have no modes, as those of
     many patches.
     """
-    scenes = {each: each.apply(request.scene) for each in alternatives_of(request.scene)}
+    has_wavelength = "wavelength" in request.capture.coords
+    found_parts = alternatives_of(request.scene, has_wavelength=has_wavelength)
+    scenes = {each: each.apply(request.scene) for each in found_parts}
     alternatives = [each for each, scene in scenes.items() if scene not in compared]
     if not alternatives:
         return []
@@ -193,10 +198,10 @@ def compare_alternatives(
     for number, alternative in enumerate(alternatives):
         progress("comparing alternatives", number / len(alternatives))
         row: Provenance = {
-            "part": type(alternative.part).__name__,
+            "part": NOTHING if alternative.part is None else type(alternative.part).__name__,
             "alternative": type(alternative.replacement).__name__,
             "path": alternative.path,
-            "defines": list(alternative.part.defines),
+            "defines": [] if alternative.part is None else list(alternative.part.defines),
         }
         try:
             with jax.enable_x64(True):  # single precision leaves nothing of a difference
