@@ -17,7 +17,8 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.subsurface import Unpolarized
 from polar_bayes.physics.surface import SmoothSurface
 
-CLEAR_FILM = ClearCoat(absorbance=0.0)
+WATER_FILM = ClearCoat(1.333, 0.0)
+"""The film that a clean sample gets by itself: a wet leaf, a puddle, dew on a plate."""
 
 KeyPath = tuple[str | int, ...]
 """Keys from a scene to a part: names of fields, and indices of tuples."""
@@ -50,20 +51,23 @@ def effects_of(scene: Scene) -> tuple[Effect, ...]:
 def alternatives_of(scene: Scene, *, has_wavelength: bool = True) -> tuple[Effect, ...]:
     """Every part of a scene with one that could be there as well, and layers that nobody sees."""
     found = _replacements(scene, operator.methodcaller("alternatives"))
-    layers = _unseen_layers(scene, has_wavelength)
-    return (*found, *(Effect(type(part).__name__, key, None, part) for key, part in layers))
+    return (*found, *unseen_layers(scene, has_wavelength=has_wavelength))
 
 
-def _unseen_layers(scene: Scene, has_wavelength: bool) -> Iterator[tuple[KeyPath, Part]]:
-    """Layers that a bare scene may have, each with its place."""
+def unseen_layers(scene: Scene, *, has_wavelength: bool) -> tuple[Effect, ...]:
+    """Films on the body and the back of a plate, where a scene has nothing there."""
+    found = []
     if scene.coat is None:
-        yield ("coat",), CLEAR_FILM
+        # Of a thick film the outer interface is all that polarization shows: only one whose index
+        # is known can be told from a body.
+        found.append(Effect("water film", ("coat",), None, WATER_FILM))
         if has_wavelength:
-            yield ("coat",), ThinFilm()
+            found.append(Effect("thin film", ("coat",), None, ThinFilm()))
     # The body of a transparent plate scatters nothing; stray light may take its place.
-    is_transparent = isinstance(scene.subsurface, Unpolarized | None)
-    if isinstance(scene.surface, SmoothSurface) and scene.surface.back is None and is_transparent:
-        yield ("surface", "back"), BackFace()
+    surface, is_clear = scene.surface, isinstance(scene.subsurface, Unpolarized | None)
+    if isinstance(surface, SmoothSurface) and surface.back is None and is_clear:
+        found.append(Effect("back face", ("surface", "back"), None, BackFace()))
+    return tuple(found)
 
 
 def _replacements(

@@ -27,6 +27,8 @@ import xarray as xr
 from jaxtyping import Array
 from numpyro import distributions as dist
 
+from polar_bayes.diagnostics.alternatives import NOTHING
+from polar_bayes.diagnostics.criticism import INDEX_PARAMETERS
 from polar_bayes.errors import FitError
 from polar_bayes.inference.initialization import HEAVY_MODE, JointInit
 from polar_bayes.inference.problem import Problem, compile_request, make_problem
@@ -45,12 +47,13 @@ from polar_bayes.numerics.optimize import (
 )
 from polar_bayes.physics.instrument import AbstractInstrumentTerm, Discrepancy
 from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.surface import SmoothSurface
 from polar_bayes.physics.variants import alternatives_of
 from polar_bayes.priors import resolve_priors
 from polar_bayes.progress import Progress
 
-NOTHING = "nothing"
-"""What stands in a place where an alternative adds a part."""
+OTHER_STARTS, OTHER_SEARCHES = 100, 4
+"""Prior draws of several parameters that only an alternative has; searches from the likeliest."""
 
 STOPPED = "it was stopped before it was done"
 """Why a comparison is missing that somebody did not wait for."""
@@ -178,9 +181,11 @@ def compare_alternatives(
     already are left out. A `FitError` where all coordinates together have no modes, as those of
     many patches.
     """
-    has_wavelength = "wavelength" in request.capture.coords
-    found_parts = alternatives_of(request.scene, has_wavelength=has_wavelength)
-    scenes = {each: each.apply(request.scene) for each in found_parts}
+    # A thin film on facets takes as long to search as the fit itself; `compare_scenes` tries it.
+    is_smooth = isinstance(request.scene.surface, SmoothSurface)
+    fringes = is_smooth and "wavelength" in request.capture.coords
+    offered = alternatives_of(request.scene, has_wavelength=fringes)
+    scenes = {each: each.apply(request.scene) for each in offered}
     alternatives = [each for each, scene in scenes.items() if scene not in compared]
     if not alternatives:
         return []
@@ -199,7 +204,9 @@ def compare_alternatives(
         progress("comparing alternatives", number / len(alternatives))
         row: Provenance = {
             "part": NOTHING if alternative.part is None else type(alternative.part).__name__,
-            "alternative": type(alternative.replacement).__name__,
+            "alternative": alternative.name
+            if alternative.part is None
+            else type(alternative.replacement).__name__,
             "path": alternative.path,
             "defines": [] if alternative.part is None else list(alternative.part.defines),
         }
@@ -243,11 +250,28 @@ def _with_scene(
     starts[:, here] = heavy[:, there]
     covariance[np.ix_(here, here)] = symmetrize(modes.covariance[0])[np.ix_(there, there)]
     covariance[np.diag_indices_from(covariance)] *= 1.0 + 1e-9  # positive definite after rounding
-    # What only the other scene has starts at the median of its prior.
-    for name in program.positions.keys() - known.keys():
-        median = jnp.median(priors[name].sample(key, (101,)), axis=0)
-        starts[:, program.positions[name]] = dist.biject_to(program.supports[name]).inv(median)
     potential = DifferencedPotential(program.evaluated, data, np.sqrt(np.diagonal(covariance)))
+    # What only the other scene has starts at the median of its prior.
+    own = [name for name in program.positions if name not in known]
+    moved = own + [name for name in both if name in INDEX_PARAMETERS]
+    keys = dict(zip(moved, jax.random.split(key, len(moved)), strict=True))
+    drawn = {name: np.asarray(priors[name].sample(keys[name], (OTHER_STARTS,))) for name in moved}
+
+    def placed(start: np.ndarray, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        start = start.copy()
+        for name, value in values.items():
+            inverse = dist.biject_to(program.supports[name]).inv
+            start[..., program.positions[name]] = inverse(jnp.asarray(value))
+        return start
+
+    starts = placed(starts, {name: np.median(drawn[name], axis=0) for name in own})
+    if len(own) > 1:  # fringes have many modes: the likeliest of some draws, the index with them
+        others = [
+            placed(starts[0], {name: each[number] for name, each in drawn.items()})
+            for number in range(OTHER_STARTS)
+        ]
+        others.sort(key=lambda z: potential(z)[0])
+        starts = np.vstack([starts, *others[:OTHER_SEARCHES]])
     return potential, starts, covariance
 
 
