@@ -468,11 +468,12 @@ def _alternatives(fit: FitView, absent: Sequence[Scalar]) -> Finding:
         # What a smooth error has stood in for without harm to the answer only widens it.
         stands_in = part == NOTHING and not moves.any()
         return judged_by(p_value, highest, sentence, most="caution" if stands_in else "problem")
-    # A layer is as good as none where it is as likely, and the index then is not that of the body.
+    # Under a layer that is as likely as none the index is not that of the body.
     layer, factor = table["part"] == NOTHING, table["log_bayes_factor"]
-    hides = layer & table["moves"] & table.index.str.startswith("refractive_index") & (factor > 0.0)
-    favored = (factor > LIMITS.favored) & (table["moves"] | layer)
-    undecided = table[favored | hides | (table["moves"] & (factor > LIMITS.refuted))]
+    hidden = layer & table.index.str.startswith(INDEX) & (factor > 0.0)
+    favored = factor > LIMITS.favored
+    weighty = table["moves"] & (favored | hidden)
+    undecided = table[(table["moves"] & (factor > LIMITS.refuted)) | (layer & favored)]
     if undecided.empty:
         return Finding("passed", p_value, highest)
     answers = [
@@ -486,8 +487,7 @@ def _alternatives(fit: FitView, absent: Sequence[Scalar]) -> Finding:
         f"{whose * bool(undecided['part'].eq(NOTHING).any())}; unless "
         "you know the part, report both answers, as polar_bayes.compare_scenes gives them."
     )
-    found = "caution" if (favored | hides).any() else "note"
-    return Finding(found, p_value, highest, sentence)
+    return Finding("caution" if weighty.any() else "note", p_value, highest, sentence)
 
 
 def _swap_text(alternative: str, part: str) -> str:

@@ -52,6 +52,7 @@ from polar_bayes.scenes.library import (
     named_setup,
     scene_library,
 )
+from polar_bayes.scenes.neighbors import suits_index
 from polar_bayes.scenes.sentences import SceneComparison, is_apart
 
 METHOD = Importance(draws=2048, rounds=12)
@@ -371,6 +372,7 @@ def _choose_layers(fits: _Fits, *, fringes: bool) -> tuple[set[str], list[str]]:
             for scene in [fits.done[name].request.scene]
             for each in unseen_layers(scene, has_wavelength=fringes)
             if layer in ("", each.name)
+            and (each.name == "thin film" or suits_index(each.name, index))
         }
         fits.add_all(scenes, fits.count + len(scenes))
         return [name for name in scenes if name in fits.done]
@@ -378,6 +380,7 @@ def _choose_layers(fits: _Fits, *, fringes: bool) -> tuple[set[str], list[str]]:
     def gain(name: str, other: str) -> tuple[float, float]:
         return _gain(fits.done[name], fits.done[other])
 
+    index = fits.done[base].view.result["posterior"].data_vars.get("refractive_index")
     layered = fit_layers([base])
     found = max(layered, key=lambda name: fits.done[name].elpd, default=base)
     if is_apart(*gain(found, base)):
@@ -387,9 +390,10 @@ def _choose_layers(fits: _Fits, *, fringes: bool) -> tuple[set[str], list[str]]:
         more, error = gain(found, best)
         if not is_apart(-more, error) and (more > 0.0 or not fits.done[found].unexplained):
             return {found, *others}, []
-    if found in layered and min(gain(found, name)[0] - gain(found, name)[1] for name in bare) > 0.0:
+    more, error = gain(found, base)
+    if more > error and fits.done[found].elpd > fits.done[best].elpd:
         return bare | {found}, []  # it predicts best, if not by much: both answers are stacked
-    return bare, [name for name in layered if not is_apart(*gain(base, name))]
+    return bare, [name for name in layered if not is_apart(*gain(best, name))]
 
 
 def _fit_choices(

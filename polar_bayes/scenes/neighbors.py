@@ -19,12 +19,13 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Collection, Mapping
+from types import MappingProxyType
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 from numpyro import distributions as dist
 
 from polar_bayes.diagnostics.alternatives import NOTHING
@@ -54,6 +55,14 @@ from polar_bayes.progress import Progress
 
 OTHER_STARTS, OTHER_SEARCHES = 100, 4
 """Prior draws of several parameters that only an alternative has; searches from the likeliest."""
+
+INDICES_UNDER: Mapping[str, tuple[tuple[float, float], ...]] = MappingProxyType(
+    {"water film": ((1.333, 1.42),), "thin film": ((0.0, 1.4), (1.65, math.inf))}
+)
+"""Indices that a bare scene finds under a layer, which is not compared elsewhere: under water from
+those of bodies of 1.33 to 1.8. Few solids have one below 1.4 or above 1.65; a film gives them."""
+SLACK = 1.5
+"""Posterior sds by which an index may be beyond these."""
 
 STOPPED = "it was stopped before it was done"
 """Why a comparison is missing that somebody did not wait for."""
@@ -167,6 +176,19 @@ def try_alternatives(
         return {"alternatives_failed": STOPPED}
 
 
+def suits_index(layer: str, index: ArrayLike | None) -> bool:
+    """Whether draws of the index of a bare scene, (chain, draw, ...), may be those of a layer."""
+    if index is None:
+        return False
+    draws = np.asarray(index)
+    mean, sd = draws.mean(axis=(0, 1)), draws.std(axis=(0, 1))
+    within = [
+        (mean > low - SLACK * sd) & (mean < high + SLACK * sd)
+        for low, high in INDICES_UNDER.get(layer, ((0.0, math.inf),))
+    ]
+    return bool(np.any(within))
+
+
 def compare_alternatives(
     request: Request,
     problem: Problem,
@@ -185,7 +207,11 @@ def compare_alternatives(
     is_smooth = isinstance(request.scene.surface, SmoothSurface)
     fringes = is_smooth and "wavelength" in request.capture.coords
     offered = alternatives_of(request.scene, has_wavelength=fringes)
-    scenes = {each: each.apply(request.scene) for each in offered}
+    index = posterior.get("refractive_index")
+    called_for = [
+        each for each in offered if each.part is not None or suits_index(each.name, index)
+    ]
+    scenes = {each: each.apply(request.scene) for each in called_for}
     alternatives = [each for each, scene in scenes.items() if scene not in compared]
     if not alternatives:
         return []
