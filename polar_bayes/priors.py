@@ -517,6 +517,8 @@ _ROWS: dict[str, dist.Distribution] = {
     "coat_absorbance": dist.HalfNormal(0.2),
     "film_refractive_index": dist.TruncatedNormal(1.45, 0.1, low=1.2, high=2.0),
     "film_thickness": dist.LogNormal(math.log(200.0), 0.7),
+    # A blackened back sends nothing, a beam that the detector catches whole sends all.
+    "back_face_share": Beta(1.0, 1.0),
     # How far the normal leans from the stated one: that of a sample laid down by eye.
     "normal_tilt_x": dist.Normal(0.0, 2.0),
     "normal_tilt_y": dist.Normal(0.0, 2.0),

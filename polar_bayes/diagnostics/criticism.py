@@ -20,7 +20,7 @@ from arviz_stats.base import array_stats
 from scipy.special import logsumexp
 
 from polar_bayes.capture.plausibility import IndexByEye, index_sentences
-from polar_bayes.diagnostics.alternatives import alternatives
+from polar_bayes.diagnostics.alternatives import NOTHING, alternatives
 from polar_bayes.diagnostics.finding import Finding, join, judged_by, listed, p_text
 from polar_bayes.diagnostics.limits import LIMITS
 from polar_bayes.diagnostics.parameters import Scalar, with_entries
@@ -459,26 +459,40 @@ def _alternatives(fit: FitView, absent: Sequence[Scalar]) -> Finding:
     # The mean of Bayes factors is above 1/p with probability p at most, where the fitted scene is
     # right and its truth is drawn from its priors.
     p_value = math.exp(min(0.0, math.log(factors.size) - float(logsumexp(factors))))
+    moves = table["moves"][table["alternative"] == alternative]
     if level(p_value) != "passed":
         sentence = (
-            f"Another part explains the readings better: {alternative} in the place of {part} "
-            f"({path}), by a Bayes factor of {_factor_text(highest)}; fit the scene that has it."
+            f"Another part explains the readings better: {_swap_text(alternative, part)} ({path}), "
+            f"by a Bayes factor of {_factor_text(highest)}; fit the scene that has it."
         )
-        return judged_by(p_value, highest, sentence)
-    undecided = table[table["moves"] & (table["log_bayes_factor"] > LIMITS.refuted)]
+        # What a smooth error has stood in for without harm to the answer only widens it.
+        stands_in = part == NOTHING and not moves.any()
+        return judged_by(p_value, highest, sentence, most="caution" if stands_in else "problem")
+    # Under a layer that is as likely as none the index is not that of the body.
+    layer, factor = table["part"] == NOTHING, table["log_bayes_factor"]
+    hidden = layer & table.index.str.startswith(INDEX) & (factor > 0.0)
+    favored = factor > LIMITS.favored
+    weighty = table["moves"] & (favored | hidden)
+    undecided = table[(table["moves"] & (factor > LIMITS.refuted)) | (layer & favored)]
     if undecided.empty:
         return Finding("passed", p_value, highest)
     answers = [
         f"{label} is {row['other']:.3g}, {abs(row['shift']):.1f} sd away, with "
-        f"{row['alternative']} in the place of {row['part']}"
-        for label, row in undecided.iterrows()
+        + _swap_text(row["alternative"], row["part"])
+        for label, row in undecided.sort_values("log_bayes_factor", ascending=False).iterrows()
     ]
+    whose = "; the index is that of the outermost interface, which under a film is the film's"
     sentence = (
-        f"The answer rests on a part that the readings do not decide: {listed(answers)}; unless "
+        f"The answer rests on a part that the readings do not decide: {listed(answers)}"
+        f"{whose * bool(undecided['part'].eq(NOTHING).any())}; unless "
         "you know the part, report both answers, as polar_bayes.compare_scenes gives them."
     )
-    is_favored = bool((undecided["log_bayes_factor"] > LIMITS.favored).any())
-    return Finding("caution" if is_favored else "note", p_value, highest, sentence)
+    return Finding("caution" if weighty.any() else "note", p_value, highest, sentence)
+
+
+def _swap_text(alternative: str, part: str) -> str:
+    """`GGX in the place of Beckmann`, `a water film`."""
+    return f"a {alternative}" if part == NOTHING else f"{alternative} in the place of {part}"
 
 
 def _without_idle(table: pd.DataFrame, absent: Sequence[Scalar]) -> pd.DataFrame:

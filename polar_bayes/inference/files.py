@@ -440,7 +440,7 @@ SCENES = Group(
     names=(*_OF_SCENES, "index_bound"),  # which earlier versions did not write
     variables=_OF_SCENES,
     kinds=dict.fromkeys(("scene", "parameter", "parts", "criticism"), TEXTS),
-    attributes={"left_out": TEXT, "lifted?": TEXT},
+    attributes={"left_out": TEXT, "lifted?": TEXT, "undecided?": TEXT},
 )
 """The group `scenes`: the comparison behind a fit with scene="auto"."""
 

@@ -2,6 +2,7 @@ from . import input_quantities as input_quantities
 from . import instrument as instrument
 from .coat import (
     AbstractCoat as AbstractCoat,
+    BackFace as BackFace,
     ClearCoat as ClearCoat,
     CoatStack as CoatStack,
     ThinFilm as ThinFilm,

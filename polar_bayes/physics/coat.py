@@ -1,4 +1,4 @@
-"""What lies on the body: clear coats, thin films, and stacks of them.
+"""What lies on the body, or behind it: coats, thin films, stacks of them, and the back of a plate.
 
 A coat lies on every facet of a rough surface alike. One of your own says which layers it adds.
 """
@@ -8,11 +8,12 @@ import dataclasses
 import math
 from typing import Annotated, override
 
+import jax.numpy as jnp
 from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.part import Parameters, Part, Range, Setting, check_part, value_of
-from polar_bayes.physics.stack import Layer
+from polar_bayes.physics.stack import Layer, Stack
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,3 +127,49 @@ class CoatStack(AbstractCoat):
     @override
     def layers(self, parameters: Parameters, wavelength: Array | None) -> tuple[Layer, ...]:
         return tuple(layer for coat in self.coats for layer in coat.layers(parameters, wavelength))
+
+
+@dataclasses.dataclass(frozen=True)
+class BackFace(Part):
+    r"""The back of a transparent plate: reflections from it add as powers.
+
+    $$ R = R_{12} + \text{share} \cdot \frac{(1-R_{12})^2 R_{12} A^2}{1 - R_{12}^2 A^2}, \qquad
+       A = e^{-\text{absorbance}/\cos\theta_\text{plate}} $$
+
+    for s and p, with air behind the plate and $R_{12}$ of its front, coats included. Light from
+    the back leaves the plate beside the first reflection, so that a detector may miss part of it.
+
+    Args:
+        share: Share of the light from the back that the detector catches, 1, 0 to 1; a name
+            fits it.
+        absorbance: Minus the log of the share of light that passes the plate once at normal
+            incidence, 1, >= 0; a name fits it, and 0 leaves it out.
+
+    Raises:
+        SceneError: A setting is neither a number in its range nor a name.
+
+    Source:
+        Byrnes (2016), arXiv:1603.02720 (incoherent layers).
+    """
+
+    share: Annotated[Setting, Range(0.0, 1.0)] = "back_face_share"
+    absorbance: Annotated[Setting, Range(0.0, 100.0)] = 0.0
+
+    def behind(self, front: Stack, parameters: Parameters) -> Stack:
+        """The whole plate: its front, the plate as one thick layer, and air behind it.
+
+        Args:
+            front: The body, which is the plate, and what lies on it.
+            parameters: Material parameters by name. Each broadcasts with (..., view).
+
+        Returns:
+            Layers on air.
+        """
+        clear = self.absorbance == 0.0
+        absorbance = None if clear else value_of(self.absorbance, parameters)
+        plate = Layer(front.refractive_index, absorbance)
+        return Stack(jnp.ones_like(front.refractive_index), (*front.layers, plate))
+
+    @override
+    def simpler(self) -> tuple[Part | None, ...]:
+        return (None,)

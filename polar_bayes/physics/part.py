@@ -8,6 +8,7 @@ another could replace as well says so in `alternatives`: every fit tells what it
 import abc
 import dataclasses
 from collections.abc import Iterator, Mapping
+from types import UnionType
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -98,7 +99,7 @@ def parameters_of(*parts: Any) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def check_part(value: object, where: str, kind: type, allowed: str) -> None:
+def check_part(value: object, where: str, kind: type | UnionType, allowed: str) -> None:
     """Refuse a part of the wrong kind, naming the right ones."""
     if not isinstance(value, kind):
         raise SceneError(f"{value!r} is no such part", where=where, hint=f"give {allowed}")
@@ -180,6 +181,7 @@ MATERIAL: dict[str, Quantity] = {
     "coat_absorbance": Quantity("", "absorbance of the coat at normal incidence"),
     "film_refractive_index": Quantity("", "refractive index of the film"),
     "film_thickness": Quantity("", "thickness of the film", "nm"),
+    "back_face_share": Quantity("", "share of the light from the back of a plate that is caught"),
     "normal_tilt_x": Quantity("", "lean of the normal towards azimuth 0", "degree"),
     "normal_tilt_y": Quantity("", "lean of the normal towards azimuth 90", "degree"),
 }
@@ -238,6 +240,7 @@ ABSENT: dict[str, Absence] = {
     "subsurface_fraction": Absence(0.0, "no light from the body", "subsurface"),
     "absorption": Absence(0.0, "no absorption"),
     "coat_absorbance": Absence(0.0, "no absorption in the coat"),
+    "back_face_share": Absence(0.0, "no light from the back of the plate"),
     "leakage": Absence(0.0, "no leakage between the channels"),
     "dolp_gain": Absence(1.0, "no loss of polarization in the polarizer"),
     "discrepancy_amplitude": Absence(0.0, "no smooth error over angle"),

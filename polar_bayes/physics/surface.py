@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from polar_bayes.physics.coat import BackFace
 from polar_bayes.physics.facets import FacetQuadrature, Facets, Microsurface, seen, sum_facets
 from polar_bayes.physics.geometry import (
     Geometry,
@@ -26,6 +27,7 @@ from polar_bayes.physics.microfacet import (
     IsotropicSlopes,
     SeparableShadowing,
 )
+from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.part import (
     Parameters,
     Part,
@@ -34,6 +36,7 @@ from polar_bayes.physics.part import (
     parameters_of,
     quotient,
     squared_rule,
+    value_of,
 )
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import Light, mirror_light, polarized_through
@@ -191,20 +194,27 @@ class SmoothSurface(AbstractSurface):
 
     Args:
         beam: The light, whose polarization counts.
+        back: BackFace(), where the body is a transparent plate that nobody blackened; or None.
 
     Raises:
-        SceneError: The beam is no point source.
+        SceneError: The beam is no point source, or the back is no back face.
     """
 
     beam: PointSource = dataclasses.field(default_factory=PointSource)
+    back: BackFace | None = None
 
     def __post_init__(self) -> None:
         check_part(self.beam, "SmoothSurface: beam", PointSource, "PointSource()")
+        check_part(self.back, "SmoothSurface: back", BackFace | None, "BackFace() or None")
 
     @override
     def light(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
-        incident = self.beam.incident(parameters, geometry)
-        return mirror_light(stack, mirror_facet(geometry), geometry, incident)
+        facet, incident = mirror_facet(geometry), self.beam.incident(parameters, geometry)
+        front = mirror_light(stack, facet, geometry, incident)
+        if self.back is None:
+            return front
+        plate = mirror_light(self.back.behind(stack, parameters), facet, geometry, incident)
+        return StokesMixing().mix(value_of(self.back.share, parameters), front, plate)
 
     @override
     def entering(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:

@@ -1,7 +1,8 @@
 """Variants of a scene: without some of its effects, or with another part in the place of one.
 
 There is no list of effects or of alternatives: every part whose `simpler` or `alternatives` gives
-replacements has them, wherever it is in a scene and whoever wrote it.
+replacements has them, wherever it is in a scene and whoever wrote it. Layers that nobody sees, a
+clear film or the back of a plate, are alternatives to a place where a scene has nothing.
 """
 
 import dataclasses
@@ -10,8 +11,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 from polar_bayes.errors import SceneError
+from polar_bayes.physics.coat import BackFace, ClearCoat, ThinFilm
 from polar_bayes.physics.part import Part
 from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.subsurface import Unpolarized
+from polar_bayes.physics.surface import SmoothSurface
+
+WATER_FILM = ClearCoat(1.333, 0.0)
+"""The film that a clean sample gets by itself: a wet leaf, a puddle, dew on a plate."""
 
 KeyPath = tuple[str | int, ...]
 """Keys from a scene to a part: names of fields, and indices of tuples."""
@@ -19,11 +26,11 @@ KeyPath = tuple[str | int, ...]
 
 @dataclasses.dataclass(frozen=True)
 class Effect:
-    """One part of a scene, and one replacement, simpler or alternative."""
+    """One part of a scene, or a place without one, and one replacement, simpler or alternative."""
 
     name: str
     key_path: KeyPath
-    part: Part
+    part: Part | None
     replacement: Part | None
 
     @property
@@ -41,9 +48,26 @@ def effects_of(scene: Scene) -> tuple[Effect, ...]:
     return _replacements(scene, operator.methodcaller("simpler"))
 
 
-def alternatives_of(scene: Scene) -> tuple[Effect, ...]:
-    """Every part of a scene with one that could be there as well, in the order of its fields."""
-    return _replacements(scene, operator.methodcaller("alternatives"))
+def alternatives_of(scene: Scene, *, has_wavelength: bool = True) -> tuple[Effect, ...]:
+    """Every part of a scene with one that could be there as well, and layers that nobody sees."""
+    found = _replacements(scene, operator.methodcaller("alternatives"))
+    return (*found, *unseen_layers(scene, has_wavelength=has_wavelength))
+
+
+def unseen_layers(scene: Scene, *, has_wavelength: bool) -> tuple[Effect, ...]:
+    """Films on the body and the back of a plate, where a scene has nothing there."""
+    found = []
+    if scene.coat is None:
+        # Of a thick film the outer interface is all that polarization shows: only one whose index
+        # is known can be told from a body.
+        found.append(Effect("water film", ("coat",), None, WATER_FILM))
+        if has_wavelength:
+            found.append(Effect("thin film", ("coat",), None, ThinFilm()))
+    # The body of a transparent plate scatters nothing; stray light may take its place.
+    surface, is_clear = scene.surface, isinstance(scene.subsurface, Unpolarized | None)
+    if isinstance(surface, SmoothSurface) and surface.back is None and is_clear:
+        found.append(Effect("back face", ("surface", "back"), None, BackFace()))
+    return tuple(found)
 
 
 def _replacements(

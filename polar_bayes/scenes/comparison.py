@@ -5,7 +5,7 @@ best is taken if it gains more than the standard error of the gain, or if it gai
 criticism of the present scene finds that something is left to explain. Where a body is added, the
 other bodies are compared with it before anything else is. When no extension is taken, or so many
 fits were made, alternatives to the present scene are fitted, so that what cannot be told apart is
-compared.
+compared. Layers that nobody sees, films and the back of a plate, come last.
 
 Source:
     Vehtari, Gelman & Gabry (2017), Stat. Comput. 27, 1413 (PSIS-LOO and the error of differences);
@@ -19,7 +19,7 @@ import functools
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from typing import Any
 
 import jax
@@ -42,7 +42,9 @@ from polar_bayes.inference.result import CENTRAL_95, bounds_of
 from polar_bayes.methods.importance import Importance
 from polar_bayes.numerics.compile import OutOfTimeError, run_until
 from polar_bayes.observation.links import AbstractLink
+from polar_bayes.physics.instrument import Discrepancy
 from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.variants import unseen_layers
 from polar_bayes.priors import parse_prior, support_bounds
 from polar_bayes.progress import Progress, no_progress, with_progress
 from polar_bayes.scenes.fit_request import fit_request
@@ -53,6 +55,7 @@ from polar_bayes.scenes.library import (
     named_setup,
     scene_library,
 )
+from polar_bayes.scenes.neighbors import suits_index
 from polar_bayes.scenes.sentences import SceneComparison, is_apart
 
 METHOD = Importance(draws=2048, rounds=12)
@@ -167,14 +170,17 @@ def compare_scenes(
 def compare_candidates(arguments: "FitArguments", progress: Progress) -> SceneComparison:
     """Compare the scenes that the capture allows, as far as its readings call for them."""
     library = scene_library(arguments.capture, arguments.variables)
-    arguments = arguments.among(library.single_parts())
-    lifted = lifted_prior(arguments, library.scene(library.simplest))
+    simplest = library.scene(library.simplest)
+    fringes = "wavelength" in arguments.capture.coords
+    layered = [each.apply(simplest) for each in unseen_layers(simplest, has_wavelength=fringes)]
+    arguments = arguments.among([*library.single_parts(), *layered])
+    lifted = lifted_prior(arguments, simplest)
     fits = _Fits(arguments.with_priors(lifted), progress)
     with jax.enable_x64(arguments.precision == "double"):
         _select(fits, library)
+        found = _comparison(fits, *_choose_layers(fits, fringes=fringes))
     if not lifted:
-        return _comparison(fits)
-    found = _comparison(fits)
+        return found
     stated = {name: arguments.request(scene) for name, scene in found.scenes.items()}
     return dataclasses.replace(found, lifted=lifted, requests=stated)
 
@@ -318,7 +324,10 @@ def _fitted(name: str, requests: list[Request], stage: str, share: float, report
         findings=findings,
         pointwise=np.concatenate([each.pointwise for each in loo]),
         unreliable=sum(each.unreliable for each in loo),
-        index_bound=_index_bound(view) if "bounds" in findings.index else float("nan"),
+        # Under a film the index of a body that hardly shows is where its prior has it.
+        index_bound=_index_bound(view)
+        if "bounds" in findings.index and request.scene.coat is None
+        else float("nan"),
     )
 
 
@@ -380,6 +389,49 @@ def _select(fits: _Fits, library: SceneLibrary) -> None:
         best = better
 
 
+def _choose_layers(fits: _Fits, *, fringes: bool) -> tuple[set[str], list[str]]:
+    """Scenes that may remain, by whether they have a layer, and layers that are not decided.
+
+    Systematic errors stand in for layers, so that layers are tried without them. A film makes the
+    index that of the body below it, so that it has to be told apart from none.
+    """
+    bare = set(fits.done)
+    clean = [name for name in bare if not fits.done[name].request.scene.has(Discrepancy)]
+    if not clean:
+        return bare, []
+    best, base = (max(names, key=lambda name: fits.done[name].elpd) for names in (bare, clean))
+
+    def fit_layers(bases: Iterable[str], layer: str = "") -> list[str]:
+        scenes = {
+            f"{name} + {each.name}": each.apply(scene)
+            for name in bases
+            for scene in [fits.done[name].request.scene]
+            for each in unseen_layers(scene, has_wavelength=fringes)
+            if layer in ("", each.name)
+            and (each.name == "thin film" or suits_index(each.name, index))
+        }
+        fits.add_all(scenes, fits.count + len(scenes))
+        return [name for name in scenes if name in fits.done]
+
+    def gain(name: str, other: str) -> tuple[float, float]:
+        return _gain(fits.done[name], fits.done[other])
+
+    index = fits.done[base].view.result["posterior"].data_vars.get("refractive_index")
+    layered = fit_layers([base])
+    found = max(layered, key=lambda name: fits.done[name].elpd, default=base)
+    if is_apart(*gain(found, base)):
+        near = [name for name in clean if name != base and not is_apart(*gain(base, name))]
+        others = fit_layers(near, found.removeprefix(f"{base} + "))
+        found = max([found, *others], key=lambda name: fits.done[name].elpd)
+        more, error = gain(found, best)
+        if not is_apart(-more, error) and (more > 0.0 or not fits.done[found].unexplained):
+            return {found, *others}, []
+    more, error = gain(found, base)
+    if more > error and fits.done[found].elpd > fits.done[best].elpd:
+        return bare | {found}, []  # it predicts best, if not by much: both answers are stacked
+    return bare, [name for name in layered if not is_apart(*gain(best, name))]
+
+
 def _fit_choices(
     fits: _Fits, library: SceneLibrary, choices: Iterable[Choice], most: int | None = None
 ) -> None:
@@ -427,7 +479,9 @@ def name_of(choice: Choice) -> str:
 # --- Which scenes remain, and the tables ----------------------------------------------------------
 
 
-def _comparison(fits: _Fits) -> SceneComparison:
+def _comparison(
+    fits: _Fits, allowed: Container[str] | None = None, undecided: Iterable[str] = ()
+) -> SceneComparison:
     if not fits.done:
         reasons = "; ".join(f"{name}: {why}" for name, why in fits.failed.items())
         raise FitError(
@@ -436,7 +490,7 @@ def _comparison(fits: _Fits) -> SceneComparison:
             hint="compare scenes of one material at a time, or give priors",
         )
     table = _predictions(fits.done)
-    remaining = _remaining(fits.done, table)
+    remaining = _remaining(fits.done, table, allowed)
     weights = pd.Series(
         stacking_weights(np.stack([fits.done[name].pointwise for name in remaining], axis=1)),
         index=remaining,
@@ -456,6 +510,7 @@ def _comparison(fits: _Fits) -> SceneComparison:
         fits={name: fit.view.result for name, fit in ordered.items()},
         left_out=fits.failed,
         requests={name: fit.request for name, fit in ordered.items()},
+        undecided=tuple(undecided),
     )
 
 
@@ -478,12 +533,15 @@ def _predictions(fits: Mapping[str, _Fit]) -> pd.DataFrame:
     return table[columns]
 
 
-def _remaining(fits: Mapping[str, _Fit], table: pd.DataFrame) -> list[str]:
+def _remaining(
+    fits: Mapping[str, _Fit], table: pd.DataFrame, allowed: Container[str] | None
+) -> list[str]:
     """Scenes that are not told apart from the best, and that their priors allow if any are."""
     apart = is_apart(table["elpd_diff"].abs(), table["dse"])
-    near = [str(name) for name in table.index[~apart]]
-    allowed = [name for name in near if not fits[name].is_contradicted]
-    return allowed or near
+    near = [str(name) for name in table.index[~apart] if allowed is None or name in allowed]
+    near = near or [next(str(name) for name in table.index if name in (allowed or fits))]
+    possible = [name for name in near if not fits[name].is_contradicted]
+    return possible or near
 
 
 def stacking_weights(pointwise: np.ndarray) -> np.ndarray:

@@ -2,7 +2,9 @@
 
 A candidate takes one option of each slot: a surface with its source, a body or none, the systematic
 errors of the instrument or none, and so on. Systematic errors are one option together: an unknown
-angle zero without a discrepancy explains by a shifted angle what a smooth error has caused.
+angle zero without a discrepancy explains by a shifted angle what a smooth error has caused. Layers
+that nobody sees, films and the back of a plate, are added to what was selected
+(`polar_bayes.physics.variants.unseen_layers`).
 """
 
 import dataclasses
@@ -14,7 +16,6 @@ import numpy as np
 import xarray as xr
 
 from polar_bayes.observation.links import AbstractLink, BetaLink, StokesLink, StudentTLink
-from polar_bayes.physics.coat import ThinFilm
 from polar_bayes.physics.illumination import PointSource, UniformSky
 from polar_bayes.physics.instrument import (
     AngleZero,
@@ -160,8 +161,7 @@ def scene_library(capture: xr.Dataset, variables: Collection[str] | None = None)
 
     A mirror needs views in the mirror direction of the light; a rough surface under a point source
     in that direction sends the polarization of the mirror, so that it needs a fitted brightness. A
-    sky is no candidate where the light is stated to be a beam. A thin film needs several
-    wavelengths, a leaning normal needs u.
+    sky is no candidate where the light is stated to be a beam. A leaning normal needs u.
 
     Args:
         capture: A validated Dataset of the capture schema.
@@ -181,7 +181,6 @@ def scene_library(capture: xr.Dataset, variables: Collection[str] | None = None)
         *([] if has_beam(capture) else ["sky"]),
     ]
     surfaces += [OTHER_SLOPES[name] for name in surfaces if name in OTHER_SLOPES]
-    several_colors = capture.sizes.get("wavelength", 1) > 2
     mixing = setup.scene.mixing if setup else None
     return SceneLibrary(
         surfaces={name: SURFACES[name] for name in surfaces},
@@ -190,12 +189,8 @@ def scene_library(capture: xr.Dataset, variables: Collection[str] | None = None)
         others={
             "instrument": {"systematic errors": _systematic_errors(setup)},
             **({"normal": {"leaning normal": TiltedNormal()}} if "u" in fitted else {}),
-            **({"coat": {"thin film": _FILM}} if several_colors else {}),
         },
     )
-
-
-_FILM = ThinFilm("film_refractive_index", "film_thickness")
 
 
 def named_setup(capture: xr.Dataset) -> Setup | None:

@@ -19,14 +19,17 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Collection, Mapping
+from types import MappingProxyType
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 from numpyro import distributions as dist
 
+from polar_bayes.diagnostics.alternatives import NOTHING
+from polar_bayes.diagnostics.criticism import INDEX_PARAMETERS
 from polar_bayes.errors import FitError
 from polar_bayes.inference.initialization import HEAVY_MODE, JointInit
 from polar_bayes.inference.problem import Problem, compile_request, make_problem
@@ -45,9 +48,21 @@ from polar_bayes.numerics.optimize import (
 )
 from polar_bayes.physics.instrument import AbstractInstrumentTerm, Discrepancy
 from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.surface import SmoothSurface
 from polar_bayes.physics.variants import alternatives_of
 from polar_bayes.priors import resolve_priors
 from polar_bayes.progress import Progress
+
+OTHER_STARTS, OTHER_SEARCHES = 100, 4
+"""Prior draws of several parameters that only an alternative has; searches from the likeliest."""
+
+INDICES_UNDER: Mapping[str, tuple[tuple[float, float], ...]] = MappingProxyType(
+    {"water film": ((1.333, 1.42),), "thin film": ((0.0, 1.4), (1.65, math.inf))}
+)
+"""Indices that a bare scene finds under a layer, which is not compared elsewhere: under water from
+those of bodies of 1.33 to 1.8. Few solids have one below 1.4 or above 1.65; a film gives them."""
+SLACK = 1.5
+"""Posterior sds by which an index may be beyond these."""
 
 STOPPED = "it was stopped before it was done"
 """Why a comparison is missing that somebody did not wait for."""
@@ -161,6 +176,19 @@ def try_alternatives(
         return {"alternatives_failed": STOPPED}
 
 
+def suits_index(layer: str, index: ArrayLike | None) -> bool:
+    """Whether draws of the index of a bare scene, (chain, draw, ...), may be those of a layer."""
+    if index is None:
+        return False
+    draws = np.asarray(index)
+    mean, sd = draws.mean(axis=(0, 1)), draws.std(axis=(0, 1))
+    within = [
+        (mean > low - SLACK * sd) & (mean < high + SLACK * sd)
+        for low, high in INDICES_UNDER.get(layer, ((0.0, math.inf),))
+    ]
+    return bool(np.any(within))
+
+
 def compare_alternatives(
     request: Request,
     problem: Problem,
@@ -175,7 +203,15 @@ def compare_alternatives(
     already are left out. A `FitError` where all coordinates together have no modes, as those of
     many patches.
     """
-    scenes = {each: each.apply(request.scene) for each in alternatives_of(request.scene)}
+    # A thin film on facets takes as long to search as the fit itself; `compare_scenes` tries it.
+    is_smooth = isinstance(request.scene.surface, SmoothSurface)
+    fringes = is_smooth and "wavelength" in request.capture.coords
+    offered = alternatives_of(request.scene, has_wavelength=fringes)
+    index = posterior.get("refractive_index")
+    called_for = [
+        each for each in offered if each.part is not None or suits_index(each.name, index)
+    ]
+    scenes = {each: each.apply(request.scene) for each in called_for}
     alternatives = [each for each, scene in scenes.items() if scene not in compared]
     if not alternatives:
         return []
@@ -193,10 +229,12 @@ def compare_alternatives(
     for number, alternative in enumerate(alternatives):
         progress("comparing alternatives", number / len(alternatives))
         row: Provenance = {
-            "part": type(alternative.part).__name__,
-            "alternative": type(alternative.replacement).__name__,
+            "part": NOTHING if alternative.part is None else type(alternative.part).__name__,
+            "alternative": alternative.name
+            if alternative.part is None
+            else type(alternative.replacement).__name__,
             "path": alternative.path,
-            "defines": list(alternative.part.defines),
+            "defines": [] if alternative.part is None else list(alternative.part.defines),
         }
         try:
             with jax.enable_x64(True):  # single precision leaves nothing of a difference
@@ -238,11 +276,28 @@ def _with_scene(
     starts[:, here] = heavy[:, there]
     covariance[np.ix_(here, here)] = symmetrize(modes.covariance[0])[np.ix_(there, there)]
     covariance[np.diag_indices_from(covariance)] *= 1.0 + 1e-9  # positive definite after rounding
-    # What only the other scene has starts at the median of its prior.
-    for name in program.positions.keys() - known.keys():
-        median = jnp.median(priors[name].sample(key, (101,)), axis=0)
-        starts[:, program.positions[name]] = dist.biject_to(program.supports[name]).inv(median)
     potential = DifferencedPotential(program.evaluated, data, np.sqrt(np.diagonal(covariance)))
+    # What only the other scene has starts at the median of its prior.
+    own = [name for name in program.positions if name not in known]
+    moved = own + [name for name in both if name in INDEX_PARAMETERS]
+    keys = dict(zip(moved, jax.random.split(key, len(moved)), strict=True))
+    drawn = {name: np.asarray(priors[name].sample(keys[name], (OTHER_STARTS,))) for name in moved}
+
+    def placed(start: np.ndarray, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        start = start.copy()
+        for name, value in values.items():
+            inverse = dist.biject_to(program.supports[name]).inv
+            start[..., program.positions[name]] = inverse(jnp.asarray(value))
+        return start
+
+    starts = placed(starts, {name: np.median(drawn[name], axis=0) for name in own})
+    if len(own) > 1:  # fringes have many modes: the likeliest of some draws, the index with them
+        others = [
+            placed(starts[0], {name: each[number] for name, each in drawn.items()})
+            for number in range(OTHER_STARTS)
+        ]
+        others.sort(key=lambda z: potential(z)[0])
+        starts = np.vstack([starts, *others[:OTHER_SEARCHES]])
     return potential, starts, covariance
 
 

@@ -40,6 +40,8 @@ class SceneComparison:
         requests: What is to be fitted, by scene, with every default filled in.
         lifted: Prior of the index by which all scenes were compared, by its name, where Brewster's
             angle by eye means an index that the stated prior excludes; otherwise empty.
+        undecided: Scenes with a film or a back face that the readings do not tell from none, and
+            that do not remain.
     """
 
     table: pd.DataFrame
@@ -50,6 +52,7 @@ class SceneComparison:
     left_out: Mapping[str, str]
     requests: Mapping[str, Request]
     lifted: Mapping[str, dist.Distribution] = dataclasses.field(default_factory=dict)
+    undecided: tuple[str, ...] = ()
 
     @property
     def weights(self) -> dict[str, float]:
@@ -83,6 +86,7 @@ class SceneComparison:
             {
                 "left_out": json.dumps(dict(self.left_out)),
                 "lifted": ", ".join(f"{n} by {describe_prior(x)}" for n, x in self.lifted.items()),
+                "undecided": json.dumps(list(self.undecided)),
             },
         )
 
@@ -140,13 +144,19 @@ def scene_sentences(result: xr.DataTree | SceneComparison) -> list[str]:
     if len(remaining) == 1:
         sentences.append(f"One remains: {chosen}.")
     else:
-        listed = ", ".join(f"{name} ({share:.0%})" for name, share in remaining.items())
+        shares = ", ".join(f"{name} ({share:.0%})" for name, share in remaining.items())
         sentences.append(
-            f"{len(remaining)} remain, and the answer is stacked from them: {listed}. They predict "
+            f"{len(remaining)} remain, and the answer is stacked from them: {shares}. They predict "
             "readings about equally well."
         )
-    others = found.sel(scene=[name for name in found["scene"].to_numpy() if weight[name] == 0.0])
+    undecided = json.loads(str(found.attrs.get("undecided", "[]")))
+    gone = weight.index[(weight == 0.0) & ~weight.index.isin(undecided)]
+    others = found.sel(scene=[name for name in found["scene"].to_numpy() if name in gone])
     sentences += [_why_not(others.sel(scene=name)) for name in others["scene"].to_numpy()[:4]]
+    if undecided:
+        hidden = any("film" in name for name in undecided)
+        whose = "; the index is that of the outermost interface, the film's where there is one"
+        sentences.append(f"The readings do not decide {listed(undecided)}{whose * hidden}.")
     sentences += _escaped(found, chosen)
     if len(remaining) > 1:
         sentences += _between(found)

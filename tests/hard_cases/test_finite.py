@@ -23,7 +23,7 @@ from hard_cases.catalogue import (
 )
 from jaxtyping import Array
 
-from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
+from polar_bayes.physics.coat import BackFace, ClearCoat, CoatStack, ThinFilm
 from polar_bayes.physics.dispersion import Cauchy, Sellmeier
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
@@ -87,7 +87,7 @@ EFFECT_SCENES = {
         dispersion=Sellmeier(),
     ),
     "a plate under film and coat": Scene(
-        SmoothSurface(BEAM),
+        SmoothSurface(BEAM, BackFace(absorbance=0.1)),
         Unpolarized("albedo", InternalReflection()),
         StokesMixing(),
         CoatStack((ThinFilm(), ClearCoat())),

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from polar_bayes.physics.coat import AbstractCoat, ClearCoat, ThinFilm
+from polar_bayes.errors import SceneError
+from polar_bayes.physics.coat import AbstractCoat, BackFace, ClearCoat, CoatStack, ThinFilm
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
+from polar_bayes.physics.illumination import PointSource
 from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.stack import Layer, Stack
+from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.subsurface import Lambertian
 from polar_bayes.physics.surface import InternalReflection, SmoothSurface
 
@@ -126,3 +129,66 @@ def test_fringes_move_with_color_and_angle() -> None:
 def test_a_clear_coat_has_no_filter_in_the_program() -> None:
     assert ClearCoat(1.5, 0.0).layers({}, None) == (Layer(jnp.asarray(1.5), None, None),)
     assert ClearCoat(1.5, 0.1).layers({}, None)[0].absorbance is not None
+
+
+# --- The back of a plate --------------------------------------------------------------------------
+
+DEGREES = np.array([0.0, 20.0, 45.0, 56.3, 75.0, 89.9])
+BESIDE = Geometry.from_degrees(
+    view_zenith=DEGREES,
+    view_azimuth=180.0,
+    light_zenith=DEGREES,
+    light_azimuth=0.0,
+    wavelength=550.0,
+)
+
+
+@pytest.mark.parametrize("absorbance", [0.0, 0.4])
+def test_a_share_of_the_light_from_the_back_adds_to_that_of_the_front(absorbance: float) -> None:
+    """R + share T^2 A^2 R/(1 - A^2 R^2) for s and p, from amplitudes."""
+    n, share = 1.515, 0.7
+    scene = Scene(SmoothSurface(back=BackFace("back_face_share", absorbance)))
+    light = stokes_of(scene, {"refractive_index": n, "back_face_share": share}, BESIDE)
+    cos, sin = np.cos(np.radians(DEGREES)), np.sin(np.radians(DEGREES))
+    inside = np.sqrt(1.0 - (sin / n) ** 2)
+    passed = np.exp(-2.0 * absorbance / inside)
+    for sign, mirrored in (
+        (1.0, ((cos - n * inside) / (cos + n * inside)) ** 2),
+        (-1.0, ((n * cos - inside) / (n * cos + inside)) ** 2),
+    ):
+        back = (1.0 - mirrored) ** 2 * passed * mirrored / (1.0 - passed * mirrored**2)
+        found = light[:, 0] + sign * light[:, 1]
+        np.testing.assert_allclose(found, mirrored + share * back, rtol=1e-12, atol=1e-15)
+        assert np.all(found <= 1.0 + 1e-15)  # nothing is gained, even at grazing
+
+
+@pytest.mark.parametrize("film", [None, ThinFilm(1.38, 100.0)])
+def test_the_whole_back_is_a_coat_on_air_and_none_of_it_is_a_plate(film: ThinFilm | None) -> None:
+    """In polarized light and under a film, too: a coat of the plate's index on a body of 1."""
+    beam, n = PointSource(LinearPolarization(0.6, 30.0)), 1.515
+    plate, coats = ClearCoat(n, 0.1), (film,) if film else ()
+    over_air = Scene(SmoothSurface(beam), coat=CoatStack((*coats, plate)))
+    bare = Scene(SmoothSurface(beam), coat=film)
+    scene = Scene(SmoothSurface(beam, BackFace("back_face_share", 0.1)), coat=film)
+    for share, same, index in ((1.0, over_air, 1.0), (0.0, bare, n)):
+        found = stokes_of(scene, {"refractive_index": n, "back_face_share": share}, BESIDE)
+        expected = stokes_of(same, {"refractive_index": index}, BESIDE)
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-15)
+
+
+def test_viewer_and_light_may_change_places_at_a_plate_with_its_back() -> None:
+    scene = Scene(SmoothSurface(back=BackFace(0.7)))
+    there = Geometry.from_degrees(
+        view_zenith=[20.0, 70.0], view_azimuth=180.0, light_zenith=[40.0, 65.0], light_azimuth=0.0
+    )
+    values = {"refractive_index": 1.5}
+    found = (
+        stokes_of(scene, values, there)[:, :2],
+        stokes_of(scene, values, there.reversed())[:, :2],
+    )
+    np.testing.assert_allclose(*found, rtol=1e-12, atol=1e-15)
+
+
+def test_a_back_that_is_no_back_face_is_refused() -> None:
+    with pytest.raises(SceneError, match=r"back: 'black' is no such part; give BackFace\(\)"):
+        SmoothSurface(back="black")  # type: ignore[arg-type]

@@ -10,7 +10,7 @@ from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polar_bayes.physics.coat import AbstractCoat, ClearCoat, CoatStack, ThinFilm
+from polar_bayes.physics.coat import AbstractCoat, BackFace, ClearCoat, CoatStack, ThinFilm
 from polar_bayes.physics.dispersion import Cauchy, Sellmeier
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
@@ -61,7 +61,7 @@ SCENES = {
         ThinFilm(),
     ),
     "a polished plate under films and coats": Scene(
-        SmoothSurface(BEAM),
+        SmoothSurface(BEAM, BackFace(absorbance=0.1)),
         Unpolarized("albedo"),
         StokesMixing(),
         CoatStack((ThinFilm(), ClearCoat(), ThinFilm("second_index", "second_thickness"))),
@@ -104,6 +104,7 @@ VALUES = {
     "film_refractive_index": st.floats(1.0, 2.5),
     "film_thickness": st.floats(0.0, 1000.0),
     "second_thickness": st.floats(0.0, 1000.0),
+    "back_face_share": st.floats(0.0, 1.0),
     "cauchy_a": st.floats(1.0, 2.0),
     "cauchy_b": st.floats(0.0, 0.02),
     "sellmeier_strength": st.floats(0.0, 3.0),

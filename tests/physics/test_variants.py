@@ -10,7 +10,13 @@ import polar_bayes as pb
 from polar_bayes.physics.instrument import AbstractInstrumentTerm
 from polar_bayes.physics.part import Part
 from polar_bayes.physics.scene import FULL_SCENES
-from polar_bayes.physics.variants import effects_of, find_effects, parts_of, simplify
+from polar_bayes.physics.variants import (
+    effects_of,
+    find_effects,
+    parts_of,
+    simplify,
+    unseen_layers,
+)
 from polar_bayes.setups import SETUPS
 
 ROUGH = pb.Scene(
@@ -110,6 +116,30 @@ def test_what_holds_nothing_any_more_is_left_out_too() -> None:
     assert bare.coat is None
     without = named(pb.Scene(pb.SmoothSurface(), Body(), pb.StokesMixing()))["Body"]
     assert without == pb.Scene(pb.SmoothSurface())
+
+
+@each(
+    ("scene", "layers"),
+    [
+        (pb.Scene(pb.SmoothSurface()), ["water film", "thin film", "back face"]),
+        (SETUPS["goniometer"].scene, ["water film", "thin film", "back face"]),
+        # What scatters in a body, or on facets, is no transparent plate.
+        (SETUPS["picture"].scene, ["water film", "thin film"]),
+        (SETUPS["camera"].scene, ["water film", "thin film"]),
+        (pb.Scene(pb.SmoothSurface(), coat=pb.ClearCoat()), ["back face"]),
+        (pb.Scene(pb.SmoothSurface(back=pb.physics.BackFace())), ["water film", "thin film"]),
+        (ROUGH, []),
+    ],
+)
+def test_layers_that_nobody_sees_are_offered_where_a_scene_has_nothing(
+    scene: pb.Scene, layers: list[str]
+) -> None:
+    offered = unseen_layers(scene, has_wavelength=True)
+    assert [each.name for each in offered] == layers
+    for each_layer in offered:
+        assert set(scene.parameters) <= set(each_layer.apply(scene).parameters)
+    without = [each.name for each in unseen_layers(scene, has_wavelength=False)]
+    assert without == [name for name in layers if name != "thin film"]
 
 
 def test_a_part_and_what_is_inside_it_go_together() -> None:

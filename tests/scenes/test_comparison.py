@@ -175,6 +175,77 @@ def test_what_is_no_scene_is_refused(capture: xr.Dataset) -> None:
         pb.fit(capture, scene="auto", method="point")
 
 
+def without_fits(monkeypatch: pytest.MonkeyPatch, gains: dict[str, float]) -> None:
+    """In place of every fit, a gain for each part of its scene; the scenes in place of tables."""
+
+    def stand_in(fits: Any, name: str, request: Any) -> None:
+        total = sum(gain for part, gain in gains.items() if part in name)
+        pointwise = total / 20 + 0.05 * (-1.0) ** np.arange(20) * len(name.split(" + "))
+        view = SimpleNamespace(result={"posterior": xr.Dataset({"refractive_index": INDEX})})
+        fits.done[name] = SimpleNamespace(
+            elpd=total, pointwise=pointwise, unexplained=False, request=request, view=view
+        )
+
+    monkeypatch.setattr(selection, "_begin_to_compile", lambda _: None)
+    monkeypatch.setattr(selection._Fits, "_add", stand_in)
+    monkeypatch.setattr(selection, "_comparison", lambda fits, *layers: [list(fits.done), *layers])
+
+
+INDEX = (("chain", "draw"), 1.35 + 0.01 * np.random.default_rng(0).normal(size=(2, 50)))
+BODY, ERRORS = "mirror + unpolarized body", "mirror + systematic errors"
+
+
+@each(
+    ("gain", "remaining", "undecided"),
+    [
+        # Told apart from none, and as good as the systematic errors that stood in for it.
+        (60.0, {"mirror + back face", f"{BODY} + back face"}, []),
+        # Systematic errors are still better: it stands in for them.
+        (20.0, {"mirror", BODY, ERRORS, f"{BODY} + systematic errors"}, []),
+        # It is not told apart from none.
+        (1.0, {"mirror", BODY, ERRORS, f"{BODY} + systematic errors"}, []),
+    ],
+)
+def test_a_layer_remains_where_it_is_told_from_none_and_explains_what_errors_do(
+    monkeypatch: pytest.MonkeyPatch, gain: float, remaining: set[str], undecided: list[str]
+) -> None:
+    gains = {"systematic errors": 50.0, "back face": gain, "water film": -30.0}
+    without_fits(monkeypatch, gains)
+    plate = plate_capture(np.linspace(20.0, 75.0, 12), 0.01, seed=2)
+    tried, allowed, listed = pb.compare_scenes(plate.assign_attrs(setup="goniometer"))
+    assert {"mirror + back face", "mirror + water film"} <= set(tried)
+    assert allowed == remaining
+    assert listed == undecided
+
+
+def test_a_film_that_is_as_good_as_none_is_said_and_does_not_remain(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    without_fits(monkeypatch, {"water film": -1.0, "back face": -10.0, "systematic errors": -3.0})
+    plate = plate_capture(np.linspace(20.0, 75.0, 12), 0.01, seed=2)
+    _, allowed, listed = pb.compare_scenes(plate.assign_attrs(setup="goniometer"))
+    assert not any("film" in name for name in allowed)
+    assert listed == ["mirror + water film"]
+
+
+def test_whose_index_it_is_is_said_where_a_film_is_not_decided(
+    comparison: SceneComparison,
+) -> None:
+    undecided = dataclasses.replace(comparison, undecided=("mirror",))
+    said = " ".join(pb.scenes.scene_sentences(undecided))
+    assert "The readings do not decide mirror." in said
+    table = comparison.table.rename(index={"mirror": "mirror + water film"})
+    film = dataclasses.replace(
+        comparison,
+        table=table,
+        intervals=comparison.intervals.rename(index={"mirror": "mirror + water film"}),
+        scenes={"mirror + water film": MIRROR, "with body": PLATE},
+        undecided=("mirror + water film",),
+    )
+    said = " ".join(pb.scenes.scene_sentences(film))
+    assert "the index is that of the outermost interface, the film's where there is one" in said
+
+
 @pytest.mark.thorough
 def test_bodies_are_compared_at_once_and_a_worse_surface_not_again(
     monkeypatch: pytest.MonkeyPatch,
@@ -189,19 +260,12 @@ def test_bodies_are_compared_at_once_and_a_worse_surface_not_again(
         "leaning normal": 4.0,
     }
 
-    def stand_in(fits: Any, name: str, _: object) -> None:
-        pointwise = np.full(20, sum(gain for part, gain in gains.items() if part in name) / 20)
-        fits.done[name] = SimpleNamespace(
-            elpd=pointwise.sum(), pointwise=pointwise, unexplained=True
-        )
-
-    monkeypatch.setattr(selection, "_begin_to_compile", lambda _: None)
-    monkeypatch.setattr(selection._Fits, "_add", stand_in)
-    monkeypatch.setattr(selection, "_comparison", lambda fits: list(fits.done))
-    tried: Any = pb.compare_scenes(pb.simulate(scene="camera").assign_attrs(setup="camera"))
-    first = ["", " + Lambertian body", " + systematic errors", " + leaning normal", " + thin film"]
+    without_fits(monkeypatch, gains)
+    monkeypatch.setattr(selection, "_choose_layers", lambda *_, **__: ())
+    tried: Any = pb.compare_scenes(pb.simulate(scene="camera").assign_attrs(setup="camera"))[0]
+    first = ["", " + Lambertian body", " + systematic errors", " + leaning normal"]
     bodies = [" + unpolarized body", " + depolarizing body"]
-    assert tried[:8] == ["rough surface", "sky", *(f"rough surface{x}" for x in first[1:] + bodies)]
+    assert tried[:7] == ["rough surface", "sky", *(f"rough surface{x}" for x in first[1:] + bodies)]
     assert sum("sky" in name for name in tried) == 1
     forward, alternatives = tried[: selection.MAX_FITS], tried[selection.MAX_FITS :]
     assert forward[-1].startswith("rough surface + unpolarized body + systematic errors + ")
