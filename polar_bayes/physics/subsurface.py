@@ -142,7 +142,7 @@ class Depolarizer(AbstractSubsurface):
         escape = jnp.ones_like(n)
         if self.internal_reflection is not None:
             escape = interface.escape(parameters, geometry)
-        rays, entering = interface.beams(parameters, geometry)
+        rays, entering = interface.beams(parameters, geometry, self.phase_function.turns)
         view = _inside(geometry.view_zenith, n)
         light = _inside(rays.light_zenith, n[..., None])
         names = "refractive_index", *self.parameters
