@@ -32,6 +32,12 @@ from polar_bayes.physics.stokes import (
 Beams = tuple[Geometry, Light]
 """Rays that come from the light, and what of each enters the body."""
 
+Turns = tuple[tuple[float, float], ...]
+"""Azimuths, degree, and their shares, which sum to 1."""
+
+FOUR_TURNS: Turns = ((0.0, 0.25), (90.0, 0.25), (180.0, 0.25), (270.0, 0.25))
+"""They sum up once and twice around to nothing: all that Rayleigh's law knows of azimuth."""
+
 
 @dataclasses.dataclass(frozen=True)
 class AbstractIllumination(Part):
@@ -64,8 +70,13 @@ class AbstractIllumination(Part):
         """
 
     @abc.abstractmethod
-    def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
+    def rays(self, geometry: Geometry, around: Turns = FOUR_TURNS) -> tuple[Geometry, Array]:
         """Beams that stand for the source, for a body that asks where its light comes from.
+
+        Args:
+            geometry: Directions. Shape (..., view), degree.
+            around: Azimuths from that of the viewer, degree, and their shares, which stand for
+                all azimuths of a source that is alike all around.
 
         Returns:
             `(geometry, irradiance)` with a ray axis: directions of shape (..., view, ray), and what
@@ -77,9 +88,15 @@ class AbstractIllumination(Part):
         del parameters, geometry
         return None
 
-    def beams(self, stack: Stack, geometry: Geometry, parameters: Parameters) -> Beams:
+    def beams(
+        self,
+        stack: Stack,
+        geometry: Geometry,
+        parameters: Parameters,
+        around: Turns = FOUR_TURNS,
+    ) -> Beams:
         """Light that passes into the body, ray by ray; see `rays` and `entering`."""
-        rays, irradiance = self.rays(geometry)
+        rays, irradiance = self.rays(geometry, around)
         cos_light = cos_degrees(rays.light_zenith)
         passing = per_ray(stack).transmission(cos_light, sin_degrees(rays.light_zenith) ** 2)
         light = transmit_inward(passing, cos_light, self.incident(per_ray(dict(parameters)), rays))
@@ -133,7 +150,7 @@ class PointSource(AbstractIllumination):
         return transmit_inward(passing, cos_light, self.incident(parameters, geometry))
 
     @override
-    def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
+    def rays(self, geometry: Geometry, around: Turns = FOUR_TURNS) -> tuple[Geometry, Array]:
         rays = per_ray(geometry)
         return rays, jnp.ones_like(rays.light_zenith)
 
@@ -201,16 +218,15 @@ class UniformSky(AbstractExtendedSource):
         return Light(passing, jnp.zeros_like(passing), jnp.zeros_like(passing))
 
     @override
-    def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
-        # A squared cosine for the nodes, since transmission is steep at grazing. Four azimuths sum
-        # up once and twice around to nothing, which is all that scattering knows of azimuth.
+    def rays(self, geometry: Geometry, around: Turns = FOUR_TURNS) -> tuple[Geometry, Array]:
+        # A squared cosine for the nodes, since transmission is steep at grazing.
         cosine, weight = squared_rule(8)
         rays = per_ray(geometry)
-        columns = np.degrees(np.arccos(cosine)), 0.5 * np.pi * weight
-        zenith, solid_angle = (like(np.repeat(x, 4), rays.view_zenith) for x in columns)
-        around = like(np.tile(90.0 * np.arange(4.0), cosine.size), rays.view_azimuth)
-        rays = rays._replace(light_zenith=zenith, light_azimuth=rays.view_azimuth + around)
-        return rays, solid_angle
+        zenith = like(np.repeat(np.degrees(np.arccos(cosine)), len(around)), rays.view_zenith)
+        turns, shares = np.tile(around, (cosine.size, 1)).T
+        solid_angle = like(2.0 * np.pi * np.repeat(weight, len(around)) * shares, zenith)
+        azimuth = rays.view_azimuth + like(turns, rays.view_azimuth)
+        return rays._replace(light_zenith=zenith, light_azimuth=azimuth), solid_angle
 
 
 @dataclasses.dataclass(frozen=True)
@@ -256,7 +272,7 @@ class Disc(AbstractExtendedSource):
         return Light(passing, jnp.zeros_like(passing), jnp.zeros_like(passing))
 
     @override
-    def rays(self, geometry: Geometry) -> tuple[Geometry, Array]:
+    def rays(self, geometry: Geometry, around: Turns = FOUR_TURNS) -> tuple[Geometry, Array]:
         rays = per_ray(geometry)
         sin_view, cos_view = sin_degrees(rays.view_zenith), cos_degrees(rays.view_zenith)
         cosine, along, solid_angle = (like(x, cos_view) for x in self._directions())

@@ -379,6 +379,22 @@ class AbstractShadowing(Part):
             G. Broadcast shape, 1, in (0, 1].
         """
 
+    def twice(self, view: Array, ray: Array, light: Array, rises: Array) -> Array:
+        """Share of pairs of facets that viewer and light see, and that see each other.
+
+        Args:
+            view: G1 of the viewer. Any shape, 1, in (0, 1].
+            ray: G1 of the ray from the viewer's facet to the light's, up or down. Broadcasts.
+            light: G1 of the light. Broadcasts, 1, in (0, 1].
+            rises: Whether the ray goes up. Broadcasts.
+
+        Returns:
+            G over the area that facets show to the ray, per its cosine. Broadcast shape, 1, in
+            (0, 1]. As if all were independent, unless a part says otherwise.
+        """
+        del rises
+        return view * ray * light
+
 
 @dataclasses.dataclass(frozen=True)
 class SeparableShadowing(AbstractShadowing):
@@ -399,6 +415,13 @@ class HeightCorrelatedShadowing(AbstractShadowing):
 
     $$ G = \frac{1}{1 + \Lambda_v + \Lambda_l}, \qquad \Lambda = 1/G_1 - 1 $$
 
+    Of two facets one after the other, the lower one's ray has to pass those above it as well: with
+    x the viewer for a ray r that rises, and the light for one that falls,
+
+    $$ G = \frac{1}{(1 + \Lambda_v + \Lambda_l) (1 + \Lambda_x + \Lambda_r)} $$
+
+    which is the second order of a walk in Smith's model exactly.
+
     Source:
         Heitz 2014, Understanding the masking-shadowing function in microfacet-based BRDFs.
     """
@@ -406,6 +429,10 @@ class HeightCorrelatedShadowing(AbstractShadowing):
     @override
     def both(self, view: Array, light: Array) -> Array:
         return view * light / (view + light - view * light)
+
+    @override
+    def twice(self, view: Array, ray: Array, light: Array, rises: Array) -> Array:
+        return self.both(view, light) * self.both(ray, jnp.where(rises, view, light))
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:

@@ -24,7 +24,7 @@ import functools
 import importlib.resources
 import io
 from collections.abc import Sequence
-from typing import Annotated, NamedTuple, override
+from typing import Annotated, ClassVar, NamedTuple, override
 
 import jax.numpy as jnp
 import numpy as np
@@ -32,6 +32,7 @@ from jaxtyping import Array, ArrayLike
 
 from polar_bayes.physics.geometry import cos_degrees
 from polar_bayes.physics.half_space import CLEAREST, GRAZING, Ray, critical_cosine_squared
+from polar_bayes.physics.illumination import FOUR_TURNS, Turns
 from polar_bayes.physics.part import (
     Parameters,
     Part,
@@ -52,9 +53,24 @@ ORDERS, DEGREES = 3, 5
 AZIMUTHS = (22.5, 67.5, 112.5, 157.5)
 
 
+def _forward_turns(count: int, narrowed: float) -> Turns:
+    """Azimuths from the viewer's, the denser the nearer to the mirror side, and their shares."""
+    # Equal steps of an angle t where tan(turn/2) = narrowed tan(t/2), turn from the mirror side.
+    t = (np.arange(count) + 0.5) * np.pi / count - 0.5 * np.pi
+    share = narrowed / (np.cos(t) ** 2 + (narrowed * np.sin(t)) ** 2) / count
+    turn = np.degrees(2.0 * np.arctan(narrowed * np.tan(t)))
+    return tuple((180.0 + float(a), float(b)) for a, b in zip(turn, share, strict=True))
+
+
 @dataclasses.dataclass(frozen=True)
 class AbstractPhaseFunction(Part):
-    """The directions into which a body scatters light once."""
+    """The directions into which a body scatters light once.
+
+    Args:
+        turns: Azimuths whose mean is that of all where light comes from all around, and shares.
+    """
+
+    turns: ClassVar[Turns] = FOUR_TURNS
 
     @abc.abstractmethod
     def reflectance(
@@ -130,6 +146,8 @@ class HenyeyGreenstein(AbstractPhaseFunction):
     """
 
     anisotropy: Annotated[Setting, Range(0.0, MOST_ANISOTROPY)] = 0.8
+
+    turns: ClassVar[Turns] = _forward_turns(12, 0.35)
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.coat import AbstractCoat
+from polar_bayes.physics.coat import AbstractCoat, CoatStack, ThinFilm
 from polar_bayes.physics.dispersion import AbstractDispersion
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
@@ -37,6 +37,7 @@ from polar_bayes.physics.surface import (
     Interface,
     InternalReflection,
     RoughSurface,
+    SmoothExit,
     SmoothSurface,
 )
 from polar_bayes.repr_html import HTMLRepr, Row, Table
@@ -60,7 +61,8 @@ class Scene(HTMLRepr):
         normal: TiltedNormal(), where the stated normal may be wrong; or None where it is right.
 
     Raises:
-        SceneError: A part is of the wrong kind, or one is missing beside another.
+        SceneError: A part is of the wrong kind, one is missing beside another, or light of a body
+            leaves facets under a thin film as through a plane.
     """
 
     surface: AbstractSurface
@@ -93,6 +95,11 @@ class Scene(HTMLRepr):
             what = "nothing says how its light adds to the surface's"
             hint = "give mixing=StokesMixing() or DopMixing(), or leave subsurface=None"
             raise SceneError(what, where="subsurface", hint=hint)
+        plane = isinstance(self.surface, RoughSurface) and self.surface.way_out == SmoothExit()
+        if plane and self.subsurface is not None and _has_film(self.coat):
+            what = "facets under a thin film reflect what a plane under it lets out, up to 4% twice"
+            hint = "give the surface way_out=RoughPassage(), which makes no light"
+            raise SceneError(what, where="way_out: SmoothExit() with ThinFilm", hint=hint)
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -278,6 +285,13 @@ class Scene(HTMLRepr):
             raise SceneError(f"{', '.join(missing)} missing", where="parameters", hint=hint)
         dtype = jnp.result_type(geometry.dtype, *(parameters[name] for name in needed))
         return {name: jnp.asarray(parameters[name], dtype)[..., None] for name in needed}
+
+
+def _has_film(coat: AbstractCoat | None) -> bool:
+    """Whether a coat is a thin film, or a stack with one."""
+    if isinstance(coat, CoatStack):
+        return any(_has_film(each) for each in coat.coats)
+    return isinstance(coat, ThinFilm)
 
 
 # --- Scenes by name, as they are used and with every effect on that such a set-up may have --------

@@ -1,22 +1,26 @@
 r"""Light that meets two facets of a rough surface, one after the other.
 
 The first bounce loses what other facets hide (Smith's shadowing). Here such light meets one more
-facet: seen from the viewer, a ray v that facet m mirrors into r is hidden with probability 1 -
-G1(r), and then meets facets h as a viewer at -r sees them. With their area sigma towards -r,
+facet. Seen from the viewer, facet m mirrors the ray v into r, and facet h mirrors the ray -r into
+the light l. From a point source
 
-$$ (1 - G_1(r)) / \sigma(-r) = G_1(r) / |\cos\theta_r|, $$
+$$ S = \frac{1}{\cos\theta_v} \int \frac{D(m)}{4} \frac{D(h)}{4} \frac{G_{vrl}}{|\cos\theta_r|}
+   M_m M_h [1, 0, 0]\, dr, \qquad m = \frac{v + r}{|v + r|}, \; h = \frac{l - r}{|l - r|} $$
 
-whether r goes up or down (Smith's projected areas), so for a point source
+with the Mueller matrices M of both mirrors between their frames, and the share G of the pairs of
+facets that viewer, light and each other see (`AbstractShadowing.twice`). Light may take the same
+path backwards. Each ray is hidden or not, and a second bounce that is hidden is lost: nothing is
+made.
 
-$$ S = \frac{G_1(v)}{\cos\theta_v} \sum_m w_m \frac{G_1(r)}{|\cos\theta_r|}
-   \frac{D(h) G_1(l)}{4} M_m M_h [1, 0, 0], \qquad h = \frac{l - r}{|l - r|} $$
-
-with the Mueller matrices M of both mirrors between their frames. Each ray is hidden or not, and a
-second bounce that is hidden is lost: nothing is made.
+The integrand peaks where m or h is the mean plane: around the ray of a mirror at v, and of one at
+l. Each peak has its own nodes, whose weights share out every ray in proportion to the densities of
+both (the balance heuristic); upward and downward rays are integrated apart, since G over the cosine
+has a corner at the horizon. A sky is a sum over points.
 
 Source:
     Heitz, Hanika, d'Eon & Dachsbacher 2016, Multiple-scattering microfacet BSDFs with the Smith
-    model, ACM Trans. Graph. 35, 58: the second order, with heights taken as independent.
+    model, ACM Trans. Graph. 35, 58: the second order. Veach & Guibas 1995, Optimally combining
+    sampling techniques for Monte Carlo rendering, SIGGRAPH: the balance heuristic.
 """
 
 import dataclasses
@@ -24,19 +28,30 @@ from typing import NamedTuple, override
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.facets import Facets, Microsurface, seen
+from polar_bayes.physics.facets import Microsurface
 from polar_bayes.physics.geometry import Geometry, cos_degrees, double_angle, per_facet, sin_degrees
 from polar_bayes.physics.illumination import PointSource, UniformSky
-from polar_bayes.physics.part import Parameters, Part, at_least, quotient
+from polar_bayes.physics.microfacet import (
+    SMOOTHEST,
+    AbstractShadowing,
+    HeightCorrelatedShadowing,
+    NoShadowing,
+    SlopeEllipse,
+)
+from polar_bayes.physics.part import Parameters, Part, at_least, like, quotient, unit_rule
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import Light
 from polar_bayes.physics.surface import RoughSurface
 
 # Below this cosine or squared length a direction counts as grazing, or two as one.
 LEAST = 1e-6
+
+# Largest width of a lobe of rays in height, radian, and the least in azimuth.
+WIDEST, NARROWEST = 1.5, 1e-5
 
 # A facet that is met closer to grazing reflects as at this cosine: it shows next to no area, and
 # derivatives of two such mirrors together would leave single precision.
@@ -53,6 +68,10 @@ class Vector(NamedTuple):
     def dot(self, other: "Vector") -> Array:
         """Scalar product."""
         return self.x * other.x + self.y * other.y + self.z * other.z
+
+    def length(self) -> Array:
+        """Its length, with a finite slope at zero."""
+        return jnp.sqrt(jnp.maximum(self.dot(self), LEAST**2))
 
     def cross(self, other: "Vector") -> "Vector":
         """Vector product."""
@@ -72,18 +91,87 @@ class Vector(NamedTuple):
         return Vector(self.x * factor, self.y * factor, self.z * factor)
 
 
+class _Rays(NamedTuple):
+    """Directions by height over the horizon and azimuth, radian, and their solid angles."""
+
+    height: Array
+    azimuth: Array
+    solid_angle: Array
+
+    @property
+    def direction(self) -> Vector:
+        """Unit vectors."""
+        around = jnp.cos(self.height)
+        x, y = around * jnp.cos(self.azimuth), around * jnp.sin(self.azimuth)
+        return Vector(x, y, jnp.sin(self.height))
+
+
+class _Lobe(NamedTuple):
+    """Directions around a mirror ray, any shape; y counts from the horizon, unit radian.
+
+    Args:
+        end: Largest y.
+        center: Of the mirror ray, which may be on the other side of the horizon.
+        azimuth: Of the mirror ray.
+        width: Of a Cauchy distribution in y.
+        across: Roughness that sets the width of a Poisson kernel in azimuth.
+    """
+
+    end: Array
+    center: Array
+    azimuth: Array
+    width: Array
+    across: Array
+
+    @property
+    def angle(self) -> Array:
+        """Of the Cauchy distribution, the part from the horizon to the end."""
+        square = self.width**2 + self.center * (self.center - self.end)
+        return jnp.arctan2(self.end * self.width, square)
+
+    def narrowed(self, y: Array) -> Array:
+        """Tangent of half the angle to either side that has half the directions of one y."""
+        slope = (self.across * (jnp.sin(y) + jnp.sin(self.center))) ** 2
+        half_sum, half_difference = 0.5 * (y + self.center), 0.5 * (y - self.center)
+        apart = (2.0 * jnp.sin(half_sum) * jnp.sin(half_difference)) ** 2
+        wide = slope + (jnp.cos(y) + jnp.cos(self.center)) ** 2
+        return jnp.sqrt((slope + apart) / wide + NARROWEST**2)
+
+    def everywhere(self) -> "_Lobe":
+        """As many directions on all sides, for facets of all tilts."""
+        flat = jnp.full_like(self.width, WIDEST)
+        return self._replace(width=flat, across=1e3 * flat)
+
+    def nodes(self, share: Array, turn: Array) -> tuple[Array, Array]:
+        """Elevation and azimuth of shares of the directions of each."""
+        sin, cos = jnp.sin(self.angle * share), jnp.cos(self.angle * share)
+        y = (self.width**2 + self.center**2) * sin / (self.width * cos + self.center * sin)
+        half = jnp.arctan2(self.narrowed(y) * jnp.sin(0.5 * turn), jnp.cos(0.5 * turn))
+        return y, self.azimuth + 2.0 * half
+
+    def density(self, y: Array, azimuth: Array) -> Array:
+        """Share of the directions per y and per turn in azimuth."""
+        half, narrowed = 0.5 * (azimuth - self.azimuth), self.narrowed(y)
+        around = narrowed / ((narrowed * jnp.cos(half)) ** 2 + jnp.sin(half) ** 2)
+        return around * self.width / (self.width**2 + (y - self.center) ** 2) / self.angle
+
+
 @dataclasses.dataclass(frozen=True)
 class TwoBounceSurface(RoughSurface):
     """A rough surface whose facets light each other once.
 
-    Fields are those of `RoughSurface`. Every facet of the quadrature is paired with the light of a
-    point source, or with every other facet under a sky. Only the reflected light has a second
-    bounce: light passes into the body and out of it as without.
+    Fields are those of `RoughSurface`, but shadowing correlates heights by default: two bounces are
+    then those of a walk in Smith's model, and make no light (docs/scenes.md). A point source takes
+    8 `along` `across` rays between two facets, 240 by default, and a sky 2 `along` `across` points.
+    Only the reflected light has a second bounce: light passes into the body and out of it as by
+    `RoughSurface`.
 
     Raises:
-        SceneError: A part is of the wrong kind, or the light is neither an unpolarized point source
-            nor a uniform sky.
+        SceneError: A part is of the wrong kind, the light is neither an unpolarized point source
+            nor a uniform sky, or no facet hides another.
     """
+
+    shadowing: AbstractShadowing = dataclasses.field(default_factory=HeightCorrelatedShadowing)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -91,6 +179,10 @@ class TwoBounceSurface(RoughSurface):
             what = f"{self.illumination!r} has no second bounce"
             hint = "give PointSource() or UniformSky(), or use RoughSurface"
             raise SceneError(what, where="TwoBounceSurface: illumination", hint=hint)
+        if self.shadowing == NoShadowing():
+            what = "where no facet hides another, light meets one facet only"
+            hint = "give HeightCorrelatedShadowing() or SeparableShadowing(), or use RoughSurface"
+            raise SceneError(what, where="TwoBounceSurface: shadowing", hint=hint)
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:
@@ -109,25 +201,45 @@ class TwoBounceSurface(RoughSurface):
 
     def _twice(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Vector:
         """S0, S1 and S2 of the second bounce."""
-        facets = self.facets(parameters, geometry)
-        first = both_sides(facets.sample(geometry, seen))
-        sin_view, cos_view = sin_degrees(geometry.view_zenith), cos_degrees(geometry.view_zenith)
-        zero = jnp.zeros_like(sin_view)
-        ray = Vector(first.light_in_plane, first.light_out_of_plane, first.cos_light)
-        hidden = first.weight * _open(facets.per_facet(), ray)
-        share = hidden * _open(facets, Vector(sin_view, zero, cos_view))[..., None, :]
-
-        back = jax.tree.map(jnp.negative, ray)
-        view = Vector(*(x[..., None, :] for x in (sin_view, zero, cos_view)))
-        axis = view.across(back)
         if isinstance(self.illumination, PointSource):
-            arriving = self._from_point(facets.per_facet(), stack, geometry, back, axis)
-        else:
-            arriving = self._from_sky(parameters, stack, geometry, back, axis)
+            return self._from_point(parameters, geometry, stack)
+        # A sky is many points: (light, ..., view).
+        height = jnp.deg2rad(90.0 - jnp.abs(geometry.view_zenith))
+        ellipse = self.slopes.ellipse(parameters, geometry)
+        end = jnp.full_like(height, 0.5 * jnp.pi)
+        lobe = _lobe(ellipse, end, height, _behind(geometry))
+        lights = _nodes(self.quadrature.along, self.quadrature.across, (lobe, lobe.everywhere()))
+        view_zenith, view_azimuth, light_zenith, light_azimuth = jnp.broadcast_arrays(
+            geometry.view_zenith,
+            geometry.view_azimuth,
+            90.0 - jnp.rad2deg(lights.height),
+            geometry.view_azimuth + jnp.rad2deg(lights.azimuth),
+        )
+        geometry = Geometry(view_zenith, view_azimuth, light_zenith, light_azimuth)
+        each = self._from_point(parameters, geometry, stack)
+        return Vector(*(jnp.sum(lights.solid_angle * x, axis=0) for x in each))
+
+    def _from_point(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Vector:
+        """The same from a point source of unit irradiance."""
+        facets, stack = self.facets(parameters, geometry).per_facet(), per_facet(stack)
+        turn = geometry.light_azimuth - geometry.view_azimuth
+        view = per_facet(_towards(geometry.view_zenith, jnp.zeros_like(turn)))
+        light = per_facet(_towards(geometry.light_zenith, turn))
+        rays = self._rays(parameters, geometry)
+        ray = rays.direction
+        back = jax.tree.map(jnp.negative, ray)
+        first, aside = (jax.tree.map(f, view, ray) for f in (jnp.add, jnp.subtract))
+        second = jax.tree.map(jnp.add, light, back)
+        g_view, g_ray, g_light = (_seen_share(facets, each) for each in (view, ray, light))
+        open_share = self.shadowing.twice(g_view, g_ray, g_light, ray.z > 0.0)
+        share = _density(facets, first) * _density(facets, second) / 16.0 * open_share
+        share = share * rays.solid_angle / jnp.maximum(jnp.abs(ray.z), LEAST) / view.z
+        axis = view.across(back)
+        arriving = _mirrored(stack, second, back, light, axis)
 
         # The mirror of the first facet, from its frame to the viewer's.
-        cosine = jnp.maximum(first.cos_incidence, GRAZING)
-        power = per_facet(stack).reflection(cosine, first.sin_squared)
+        cosine = jnp.maximum(0.5 * first.length(), GRAZING)
+        power = stack.reflection(cosine, 0.25 * aside.dot(aside))
         contrast = power.contrast * power.sin_squared
         intensity = power.mean * arriving.x + contrast * arriving.y
         q = contrast * arriving.x + power.mean * arriving.y
@@ -136,69 +248,93 @@ class TwoBounceSurface(RoughSurface):
         stokes = (intensity, q * cos - u * sin, q * sin + u * cos)
         return Vector(*(jnp.sum(share * each, axis=-2) for each in stokes))
 
-    def _from_point(
-        self, facets: Microsurface, stack: Stack, geometry: Geometry, back: Vector, axis: Vector
-    ) -> Vector:
-        """Stokes vector that arrives at each first facet, in its frame, over the share hidden."""
-        turn = (geometry.light_azimuth - geometry.view_azimuth)[..., None, :]
-        sin, cos = (f(geometry.light_zenith)[..., None, :] for f in (sin_degrees, cos_degrees))
-        light = Vector(sin * cos_degrees(turn), sin * sin_degrees(turn), cos)
-        middle = jax.tree.map(jnp.add, back, light)
-        length = jnp.sqrt(jnp.maximum(middle.dot(middle), LEAST))
-        normal = middle.times(1.0 / length)
-        upright = jnp.maximum(normal.z, LEAST)
-        density = facets.density_of(normal.x / upright, normal.y / upright)
-        density = jnp.where(normal.z > LEAST, density, 0.0)
-        lit = 0.25 * density * _open(facets, light) * light.z
-        return _mirrored(per_facet(stack), lit, 0.5 * length, back, light, axis)
-
-    def _from_sky(
-        self, parameters: Parameters, stack: Stack, geometry: Geometry, back: Vector, axis: Vector
-    ) -> Vector:
-        """The same from a sky of unit radiance: every facet, as the plane's own area shows it."""
-        above = geometry._replace(view_zenith=jnp.zeros_like(geometry.view_zenith))
-        facets = self.facets(parameters, above)
-        second = both_sides(facets.sample(above, seen))
-        # An axis in front of that of the first facets: (..., second, 1, view).
-        second = jax.tree.map(lambda values: values[..., :, None, :], second)
-        normal = Vector(
-            second.light_in_plane, second.light_out_of_plane, 1.0 + second.cos_light
-        ).times(0.5 / second.cos_incidence)
-        back, axis = (Vector(*(x[..., None, :, :] for x in each)) for each in (back, axis))
-        cosine = jnp.maximum(back.dot(normal), 0.0)
-        light = Vector(*(2.0 * cosine * m - b for m, b in zip(normal, back, strict=True)))
-        free = _open(facets.per_facet().per_facet(), light) * jnp.maximum(light.z, 0.0)
-        lit = second.weight * cosine / second.cos_incidence * free
-        arriving = _mirrored(per_facet(per_facet(stack)), lit, cosine, back, light, axis)
-        return Vector(*(jnp.sum(each, axis=-3) for each in arriving))
+    def _rays(self, parameters: Parameters, geometry: Geometry) -> _Rays:
+        """From the first facet to the second: (..., ray, view)."""
+        back = geometry.reversed()
+        height, of_light = (
+            jnp.deg2rad(90.0 - jnp.abs(each.view_zenith)) for each in (geometry, back)
+        )
+        # Above the horizon until the second facet would hang over, below until the first would.
+        end = _sides(of_light, height)
+        turn = jnp.deg2rad(geometry.light_azimuth - geometry.view_azimuth)
+        of_view, of_back = (self.slopes.ellipse(parameters, each) for each in (geometry, back))
+        lobes = (
+            _lobe(of_view, end, _sides(height, -height), _behind(geometry)),
+            _lobe(of_back, end, _sides(-of_light, of_light), turn - jnp.pi + _behind(back)),
+        )
+        rays = _nodes(self.quadrature.along, 2 * self.quadrature.across, lobes)
+        rays = rays._replace(height=jnp.stack([rays.height[:, 0], -rays.height[:, 1]], axis=1))
+        # Both sides on the axis of rays, which goes in front of the views.
+        return jax.tree.map(lambda x: jnp.moveaxis(x.reshape(-1, *x.shape[2:]), 0, -2), rays)
 
 
-def _open(facets: Microsurface, ray: Vector) -> Array:
-    """G1 over the cosine of a ray that goes up or down."""
+def _towards(zenith: Array, azimuth: Array) -> Vector:
+    """Directions in the frame of the viewer, from angles in degrees."""
+    sin, cos = sin_degrees(zenith), cos_degrees(zenith)
+    return Vector(sin * cos_degrees(azimuth), sin * sin_degrees(azimuth), cos)
+
+
+def _behind(geometry: Geometry) -> Array:
+    """Azimuth of the mirror ray from that of the viewer, radian."""
+    return jnp.where(geometry.view_zenith < 0.0, 0.0, jnp.pi)
+
+
+def _seen_share(facets: Microsurface, ray: Vector) -> Array:
+    """G1 of a ray that goes up or down."""
     cosine = jnp.maximum(jnp.abs(ray.z), LEAST)
-    return facets.visible(ray.x / cosine, ray.y / cosine) / cosine
+    return facets.visible(ray.x / cosine, ray.y / cosine)
 
 
-def _mirrored(
-    stack: Stack, lit: Array, cosine: Array, back: Vector, light: Vector, axis: Vector
-) -> Vector:
+def _density(facets: Microsurface, normal: Vector) -> Array:
+    """Facet area per steradian around a vector of any length; none hangs over."""
+    upright = jnp.maximum(normal.z, LEAST)
+    density = facets.density_of(normal.x / upright, normal.y / upright)
+    return jnp.where(normal.z > LEAST, density, 0.0)
+
+
+def _mirrored(stack: Stack, facet: Vector, back: Vector, light: Vector, axis: Vector) -> Vector:
     """Stokes vector of light that facets mirror, in the frame of another one's axis."""
-    cosine = jnp.clip(cosine, GRAZING, 1.0)
+    cosine = jnp.clip(0.5 * facet.length(), GRAZING, 1.0)
     power = stack.reflection(cosine, (1.0 - cosine) * (1.0 + cosine))
     own = back.across(light)
     cos, sin = double_angle(own.dot(axis), own.dot(back.cross(axis)))
-    polarized = lit * power.contrast * power.sin_squared
-    return Vector(lit * power.mean, polarized * cos, polarized * sin)
+    polarized = power.contrast * power.sin_squared
+    return Vector(power.mean, polarized * cos, polarized * sin)
 
 
-def both_sides(sample: Facets) -> Facets:
-    """Facets on both sides of the plane of the viewer, where only one was sampled."""
-    if sample.across_s is not None:
-        return sample
+# --- Where rays and lights are sampled: around the mirror ray of a level facet --------------------
 
-    both = jax.tree.map(lambda values: jnp.concatenate([values, values], axis=-2), sample)
-    out_of_plane = sample.light_out_of_plane
-    return both._replace(
-        weight=0.5 * both.weight,
-        light_out_of_plane=jnp.concatenate([out_of_plane, -out_of_plane], axis=-2),
-    )
+
+def _lobe(ellipse: SlopeEllipse, end: Array, center: Array, azimuth: Array) -> _Lobe:
+    """Directions into which facets of these slopes mirror one ray."""
+    along = ellipse.along
+    if ellipse.shear is not None:
+        along = jnp.sqrt(along**2 + ellipse.shear**2)
+    width = jnp.clip(2.0 * along, 2.0 * SMOOTHEST, WIDEST)
+    across = at_least(ellipse.across, SMOOTHEST)
+    return _Lobe(*jnp.broadcast_arrays(end, center, azimuth, width, across))
+
+
+def _sides(up: Array, down: Array) -> Array:
+    """Values for directions above and below the horizon, on a new axis in front."""
+    return jnp.stack(jnp.broadcast_arrays(up, down))
+
+
+def _nodes(along: int, around: int, lobes: tuple[_Lobe, _Lobe]) -> _Rays:
+    """Directions on a new axis in front; heights count from the horizon as those of lobes do."""
+    node, weight = unit_rule(along)
+    turn = 2.0 * np.pi * (np.arange(around) + 0.5) / around
+    grid = (*np.meshgrid(node, turn, indexing="ij"), np.repeat(weight, turn.size) / turn.size)
+    end = lobes[0].end
+    share, turns, weights = (like(x, end).reshape(-1, *(end.ndim * (1,))) for x in grid)
+    each = (lobe.nodes(share, turns) for lobe in lobes)
+    y, azimuth = (jnp.concatenate(both) for both in zip(*each, strict=True))
+    # The densities of both add up, and so a node of one counts less near those of the other.
+    density = lobes[0].density(y, azimuth) + lobes[1].density(y, azimuth)
+    measure = 2.0 * jnp.pi * jnp.concatenate([weights, weights]) / density
+    # Derivatives are those of the integrand at nodes that keep their place between the borders:
+    # where the nodes are does not change the integral. The barrier keeps them from being found anew
+    # for each of their readers.
+    fixed = jax.lax.stop_gradient((y / end, azimuth, measure / end))
+    share, azimuth, measure = jax.lax.optimization_barrier(fixed)
+    return _Rays(end * share, azimuth, end * measure * jnp.cos(end * share))

@@ -11,7 +11,7 @@ from polar_bayes.physics.geometry import Geometry, cos_degrees, per_ray, sin_deg
 from polar_bayes.physics.half_space import CLEAREST, Ray, refract, scatter
 from polar_bayes.physics.part import Parameters, Part, Range, Setting, at_least, quotient, value_of
 from polar_bayes.physics.phase_function import AbstractPhaseFunction, Isotropic
-from polar_bayes.physics.stokes import Light
+from polar_bayes.physics.stokes import Light, polarized_through
 from polar_bayes.physics.surface import Interface, InternalReflection
 
 
@@ -142,7 +142,7 @@ class Depolarizer(AbstractSubsurface):
         escape = jnp.ones_like(n)
         if self.internal_reflection is not None:
             escape = interface.escape(parameters, geometry)
-        rays, entering = interface.beams(parameters, geometry)
+        rays, entering = interface.beams(parameters, geometry, self.phase_function.turns)
         view = _inside(geometry.view_zenith, n)
         light = _inside(rays.light_zenith, n[..., None])
         names = "refractive_index", *self.parameters
@@ -196,6 +196,9 @@ class TurbidMedium(AbstractSubsurface):
 
     $$ S = \frac{1}{n^2} [I E_0 + Q E_1,\; I E_1 + Q E_0,\; U \sqrt{E_0^2 - E_1^2}] $$
 
+    where the way out polarizes along the plane of the viewer. Grooves polarize along an axis of
+    their own, along which Q and U count in the same way (`polarized_through`).
+
     Light enters and crosses the body as through a plane, and is turned back as by a bare one:
     roughness and coats act on the way in and out only.
 
@@ -243,10 +246,6 @@ class TurbidMedium(AbstractSubsurface):
         intensity, q, u = (jnp.sum(part, axis=-1) for part in scattered)
 
         leaving = interface.exit(parameters, geometry)
-        total = intensity + q * leaving.q
-        diagonal = jnp.sqrt(jnp.maximum((1.0 - leaving.q) * (1.0 + leaving.q), 0.0))
-        return Light(
-            leaving.intensity * total / n**2,
-            quotient(intensity * leaving.q + q, total),
-            quotient(intensity * leaving.u - u * diagonal, total),
-        )
+        brightness = leaving.intensity * intensity / n**2
+        polarization = quotient(q, intensity), -quotient(u, intensity)
+        return polarized_through(leaving._replace(intensity=brightness), *polarization)

@@ -18,7 +18,13 @@ from polar_bayes.physics.geometry import (
     per_ray,
     sin_degrees,
 )
-from polar_bayes.physics.illumination import AbstractIllumination, Beams, PointSource
+from polar_bayes.physics.illumination import (
+    FOUR_TURNS,
+    AbstractIllumination,
+    Beams,
+    PointSource,
+    Turns,
+)
 from polar_bayes.physics.microfacet import (
     AbstractMicrofacet,
     AbstractShadowing,
@@ -165,8 +171,16 @@ class AbstractSurface(Part):
         """
 
     @abc.abstractmethod
-    def beams(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Beams:
+    def beams(
+        self, parameters: Parameters, geometry: Geometry, stack: Stack, around: Turns = FOUR_TURNS
+    ) -> Beams:
         """The same light ray by ray, for a body that asks where it comes from.
+
+        Args:
+            parameters: As in all methods, and so are geometry and stack.
+            geometry: Directions.
+            stack: What a facet is made of.
+            around: See `AbstractIllumination.rays`.
 
         Returns:
             `(rays, light)`: directions and light of shape (..., view, ray).
@@ -221,8 +235,10 @@ class SmoothSurface(AbstractSurface):
         return self.beam.entering(stack, geometry, parameters)
 
     @override
-    def beams(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Beams:
-        return self.beam.beams(stack, geometry, parameters)
+    def beams(
+        self, parameters: Parameters, geometry: Geometry, stack: Stack, around: Turns = FOUR_TURNS
+    ) -> Beams:
+        return self.beam.beams(stack, geometry, parameters, around)
 
     @override
     def exit(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
@@ -289,10 +305,12 @@ class RoughSurface(AbstractSurface):
         return Light(total, quotient(q, total), quotient(u, total))
 
     @override
-    def beams(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Beams:
+    def beams(
+        self, parameters: Parameters, geometry: Geometry, stack: Stack, around: Turns = FOUR_TURNS
+    ) -> Beams:
         if not self.way_out.both_ways:
-            return self.illumination.beams(stack, geometry, parameters)
-        rays, irradiance = self.illumination.rays(geometry)
+            return self.illumination.beams(stack, geometry, parameters, around)
+        rays, irradiance = self.illumination.rays(geometry, around)
         each = per_ray(dict(parameters))
         passing = self.exit(each, rays.reversed(), per_ray(stack))
         power = irradiance * cos_degrees(rays.light_zenith) * passing.intensity
@@ -333,9 +351,11 @@ class Interface:
         """Light that passes into the body; see `AbstractSurface.entering`."""
         return self.surface.entering(parameters, geometry, self.stack)
 
-    def beams(self, parameters: Parameters, geometry: Geometry) -> Beams:
+    def beams(
+        self, parameters: Parameters, geometry: Geometry, around: Turns = FOUR_TURNS
+    ) -> Beams:
         """The same ray by ray; see `AbstractSurface.beams`."""
-        return self.surface.beams(parameters, geometry, self.stack)
+        return self.surface.beams(parameters, geometry, self.stack, around)
 
     def exit(self, parameters: Parameters, geometry: Geometry) -> Light:
         """What happens to light on its way out; see `AbstractSurface.exit`."""

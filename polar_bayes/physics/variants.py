@@ -77,7 +77,10 @@ def _replacements(
     found: dict[Scene, tuple[KeyPath, Part, Part | None]] = {}
     for key_path, part in parts_of(scene):
         for replacement in offered(part):
-            simpler = simplify(scene, [Effect("", key_path, part, replacement)])
+            try:
+                simpler = simplify(scene, [Effect("", key_path, part, replacement)])
+            except SceneError:  # the scene refuses this part beside its others
+                continue
             if simpler != scene and len(key_path) >= len(found.get(simpler, ((),))[0]):
                 found[simpler] = key_path, part, replacement
     short = [_name(part, replacement) for _, part, replacement in found.values()]

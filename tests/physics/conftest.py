@@ -55,3 +55,8 @@ def thick_coats() -> np.ndarray:
 @pytest.fixture(scope="session")
 def thin_films() -> np.ndarray:
     return read("thinfilm_coherent_tmm.csv")
+
+
+@pytest.fixture(scope="session")
+def transmittances() -> np.ndarray:
+    return read("smith_walk_transmittance.csv")

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from cases import each
 
+from polar_bayes.errors import SceneError
+from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import PointSource
 from polar_bayes.physics.microfacet import GGX, AnisotropicSlopes
@@ -23,7 +25,7 @@ from polar_bayes.physics.surface import (
     RoughSurface,
     SmoothExit,
     SmoothSurface,
-)
+)from polar_bayes.physics.variants import effects_of
 
 light_of = jax.jit(Scene.light, static_argnums=0)
 ZENITHS = jnp.array([0.0, 30.0, 60.0, 80.0])
@@ -157,3 +159,36 @@ def test_polarized_light_enters_through_facets_as_it_leaves() -> None:
     for angle in (None, 0.0, 30.0, 90.0):
         rough, plane = (entering(angle, way, 1e-5) for way in (RoughPassage(), SmoothExit()))
         np.testing.assert_allclose(rough, plane, atol=1e-8)
+
+
+# --- what a plane on the way in costs ------------------------------------------------------------
+
+
+def test_a_film_on_facets_needs_facets_both_ways() -> None:
+    """Its reflectance changes with the angle, so that a plane lets out what facets reflect, too."""
+    film, stack = ThinFilm(1.9, 500.0), CoatStack((ClearCoat(1.5, 0.0), ThinFilm(1.9, 500.0)))
+    for coat in (film, stack):
+        with pytest.raises(SceneError, match=r"ThinFilm.*RoughPassage"):
+            Scene(RoughSurface(way_out=SmoothExit()), WHITE, StokesMixing(), coat)
+    scene = Scene(RoughSurface(), WHITE, StokesMixing(), film)
+    assert "RoughExit -> SmoothExit" not in [effect.name for effect in effects_of(scene)]
+    assert Scene(RoughSurface(way_out=SmoothExit()), coat=film).coat is film
+
+
+def test_how_much_light_gets_into_a_body_agrees_with_a_walk(transmittances: np.ndarray) -> None:
+    """The figures of docs/scenes.md: light that one facet reflects may enter at the next one.
+
+    What facets both ways lack is at most 6.1%, and less than .6% at normal incidence and roughness
+    .15; a plane lacks a fifth to a third at 80 degrees. Three standard errors of the table more.
+    """
+    roughness, zenith, index, share, error = transmittances.T
+    views = Geometry(zenith[:, None], 0.0 * zenith[:, None], *np.zeros((2, zenith.size, 1)))
+    material, stack = {"roughness": roughness[:, None]}, Stack(jnp.asarray(index[:, None]))
+    plane, rough = (
+        np.asarray(RoughSurface(GGX(), way_out=way).exit(material, views, stack).intensity)[:, 0]
+        for way in (SmoothExit(), RoughPassage())
+    )
+    assert np.all(rough < share + 3.0 * error)
+    assert np.all(rough > (1.0 - 0.061) * share - 3.0 * error)
+    at_80 = zenith == 80.0
+    np.testing.assert_allclose((plane / share - 1.0)[at_80], [-0.217, -0.293, -0.327], atol=0.003)

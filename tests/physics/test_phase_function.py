@@ -12,9 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from physics.test_half_space import hemisphere, read, refracted, transmittance, under_beam
 
+from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.half_space import CLEAREST, Ray
+from polar_bayes.physics.illumination import UniformSky
+from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.phase_function import HenyeyGreenstein, Isotropic
+from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.stack import Stack
+from polar_bayes.physics.subsurface import Depolarizer
+from polar_bayes.physics.surface import RoughSurface, SmoothExit
 
 
 def test_h_in_closed_form_is_that_of_chandrasekhars_equation() -> None:
@@ -205,6 +211,30 @@ def turned(way: np.ndarray, g: float, random: np.random.Generator) -> np.ndarray
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     aside = np.cos(around)[:, None] * across + np.sin(around)[:, None] * np.cross(way, across)
     return cosine[:, None] * way + sine[:, None] * aside
+
+
+class ManyTurns(HenyeyGreenstein):
+    """The same with a sky of 360 azimuths."""
+
+    turns = tuple((float(turn), 1.0 / 360.0) for turn in range(360))
+
+
+def test_a_few_azimuths_stand_for_a_sky() -> None:
+    """Dense towards the forward lobe: within .2%, also at grazing without refraction."""
+    views = Geometry.from_degrees(
+        view_zenith=[0.0, 45.0, 87.0], view_azimuth=20.0, light_zenith=0.0, light_azimuth=0.0
+    )
+    surface = RoughSurface(illumination=UniformSky(), way_out=SmoothExit())
+    for g in (0.5, 0.9):
+        material = {"roughness": 0.2, "absorption": 1.0, "subsurface_fraction": 1.0}
+        material["refractive_index"] = np.array([[1.001], [1.2]])[:, 0]
+        few, many = (
+            Scene(surface, Depolarizer(phase_function=kind(g)), StokesMixing())
+            .light(material, views)
+            .intensity
+            for kind in (HenyeyGreenstein, ManyTurns)
+        )
+        np.testing.assert_allclose(few, many, rtol=0.002)
 
 
 zenith, turn = st.floats(0.0, 89.9), st.floats(-180.0, 180.0)

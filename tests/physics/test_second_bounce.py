@@ -4,13 +4,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import smith_walk
 import vector_optics as twin
 from cases import each
 
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import PointSource, UniformSky
-from polar_bayes.physics.microfacet import GGX, AnisotropicSlopes, Beckmann
+from polar_bayes.physics.microfacet import (
+    GGX,
+    AnisotropicSlopes,
+    Beckmann,
+    HeightCorrelatedShadowing,
+    IsotropicSlopes,
+    SeparableShadowing,
+)
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.second_bounce import TwoBounceSurface
 from polar_bayes.physics.surface import RoughSurface
@@ -22,8 +30,9 @@ stokes_of = jax.jit(Scene.stokes, static_argnums=0)
 
 def second_bounce(parameters, geometry, **parts) -> np.ndarray:
     """Stokes vectors of the second bounce alone."""
+    parts = {"quadrature": MANY, "shadowing": SeparableShadowing(), **parts}
     twice, once = (
-        stokes_of(Scene(kind(**{"quadrature": MANY, **parts})), parameters, geometry)
+        stokes_of(Scene(kind(**parts)), parameters, geometry)
         for kind in (TwoBounceSurface, RoughSurface)
     )
     return np.asarray(twice - once)
@@ -36,22 +45,24 @@ def seen_from(*zenith: float) -> Geometry:
 
 
 def test_the_second_bounce_is_that_of_a_height_field(height_field_sky: np.ndarray) -> None:
-    """All orders are within 4.5% of the table, where one is up to 10% too dark.
+    """All orders are within 1.2% of the table, where one is up to 10% too dark.
 
-    The table's own errors are .2 to .7%, the quadrature's up to 1%; the rest are orders above
-    the second and heights, which Smith's theory takes as independent of slopes.
+    The table's own errors are .2 to .7%, the quadrature's up to .3%; the rest are orders above the
+    second, and heights, which Smith's theory takes as independent of slopes.
     """
     rows = height_field_sky[height_field_sky[:, 3] == 0.0]
     parameters = {"roughness": rows[:, 1], "refractive_index": 1.5}
     views = Geometry(*(jnp.asarray(x)[:, None] for x in (rows[:, 2], *np.zeros((3, len(rows))))))
+    parts = {"quadrature": MANY, "shadowing": HeightCorrelatedShadowing()}
     once, twice = (
-        np.asarray(stokes_of(Scene(kind(Beckmann(), UniformSky(), MANY)), parameters, views))[:, 0]
+        np.asarray(stokes_of(Scene(kind(Beckmann(), UniformSky(), **parts)), parameters, views))
         for kind in (RoughSurface, TwoBounceSurface)
     )
+    once, twice = once[:, 0], twice[:, 0]
     assert np.abs(once[:, 0] / rows[:, 4] - 1.0).max() > 0.09
-    np.testing.assert_allclose(twice[:, 0], rows[:, 4], rtol=0.045)
+    np.testing.assert_allclose(twice[:, 0], rows[:, 4], rtol=0.012)
     degree = twice[:, 1] / twice[:, 0] - once[:, 1] / once[:, 0]
-    assert np.abs(degree).max() < 0.02  # as docs/scenes.md says
+    assert np.abs(degree).max() < 0.021  # as docs/scenes.md says
     # What the second bounce adds, polarization included, where it adds most: within 10% and three
     # standard errors of the table.
     added = rows[:, 4:6] - height_field_sky[height_field_sky[:, 3] == 1.0][:, 4:6]
@@ -63,18 +74,106 @@ def test_the_second_bounce_is_that_of_a_height_field(height_field_sky: np.ndarra
 
 @pytest.mark.thorough
 @each("distribution", [Beckmann(), GGX()])
-@each("roughness", [0.1, 0.3, 0.5])
+@each("roughness", [0.1, 0.3, 0.5, 0.8])
 def test_no_light_is_made(distribution, roughness) -> None:
-    """Facets that reflect everything give back what comes, to 1% of quadrature, never more."""
+    """Facets that reflect everything give back what comes, to .1% of quadrature, never more."""
     mirror = {"roughness": roughness, "refractive_index": 1e5}
-    views = seen_from(0.0, 45.0, 75.0, 85.0)
-    found, once = (
-        stokes_of(Scene(kind(distribution, UniformSky(), MANY)), mirror, views)[:, 0]
-        for kind in (TwoBounceSurface, RoughSurface)
+    views = seen_from(0.0, 45.0, 75.0, 83.0, 87.0)
+    for shadowing in (SeparableShadowing(), HeightCorrelatedShadowing()):
+        found, once = (
+            stokes_of(
+                Scene(kind(distribution, UniformSky(), MANY, shadowing=shadowing)), mirror, views
+            )[:, 0]
+            for kind in (TwoBounceSurface, RoughSurface)
+        )
+        assert np.all(found <= 1.001)
+        assert np.all(found > once)
+
+
+@pytest.mark.thorough
+@each("roughness", [0.3, 0.8])
+def test_two_bounces_are_those_of_a_walk(roughness: float) -> None:
+    """With correlated heights, the first bounce and the second, each under a sky.
+
+    Within four Monte Carlo errors and what the quadrature leaves, a tenth of a percent of all light
+    for the first bounce and .4 for the second.
+    """
+    mirror, zeniths = {"roughness": roughness, "refractive_index": 1e5}, (0.0, 75.0, 87.0)
+    parts = {"shadowing": HeightCorrelatedShadowing(), "quadrature": MANY}
+    once, twice = (
+        np.asarray(
+            stokes_of(Scene(kind(GGX(), UniformSky(), **parts)), mirror, seen_from(*zeniths))
+        )[:, 0]
+        for kind in (RoughSurface, TwoBounceSurface)
     )
-    assert np.all(found <= 1.01)
-    assert np.all(found >= once)
-    assert np.all(1.0 - found < 0.35 * (1.0 - once) + 0.01)
+    count = 200_000
+    walked = np.array([smith_walk.free_after(z, roughness, count)[:2] for z in zeniths])
+    error = 4.0 * np.sqrt(walked * (1.0 - walked) / count)
+    found = np.stack([once, twice - once], axis=1)
+    assert np.all(np.abs(found - walked) < error + np.array([0.001, 0.004]))
+
+
+def between_points(count: int, seed: int) -> Geometry:
+    """Directions at random, one in three in the plane of the mirror side, one in three grazing."""
+    random = np.random.default_rng(seed)
+    view, light = random.uniform(0.0, 88.0, (2, count))
+    grazing = np.arange(count) % 3 == 0
+    view = np.where(grazing, random.uniform(70.0, 88.0, count), view)
+    turn = np.where(np.arange(count) % 3 == 1, 180.0, random.uniform(0.0, 360.0, count))
+    return Geometry.from_degrees(
+        view_zenith=view, view_azimuth=0.0, light_zenith=light, light_azimuth=turn
+    )
+
+
+def test_a_point_lights_two_facets_as_in_a_walk() -> None:
+    """Within four Monte Carlo errors and the .5% that 6 x 5 nodes leave of the second bounce."""
+    roughness, view, count = 0.3, 49.0, 200_000
+    zenith, azimuth = np.array([71.0, 30.0, 80.0, 60.0]), np.array([126.0, 180.0, 170.0, 20.0])
+    geometry = Geometry.from_degrees(
+        view_zenith=np.full(4, view), view_azimuth=0.0, light_zenith=zenith, light_azimuth=azimuth
+    )
+    mirror = {"roughness": roughness, "refractive_index": 1e5}
+    shadowing = HeightCorrelatedShadowing()
+    parts = {"distribution": GGX(), "quadrature": FacetQuadrature(), "shadowing": shadowing}
+    found = second_bounce(mirror, geometry, **parts)[:, 0]
+    lights = np.stack([twin.ray(*each) for each in zip(zenith, azimuth, strict=True)])
+    walked, error = smith_walk.second_bounce(view, lights, roughness, count)
+    assert np.all(error < 0.02 * walked)
+    assert np.all(np.abs(found - walked) < 4.0 * error + 0.005 * walked)
+
+
+@each("distribution", [Beckmann(), GGX()])
+def test_few_nodes_are_enough_for_a_point(distribution) -> None:
+    """The default beside 24 x 20 nodes, as docs/facets.md states: 2% of the brightness at most.
+
+    Where there is light: beyond 1e-6 a Beckmann surface has none to speak of.
+    """
+    geometry, random = between_points(60, 1), np.random.default_rng(2)
+    geometry = jax.tree.map(lambda x: x[:, None], geometry)
+    material = {"roughness": 0.05 * 20.0 ** random.random(60), "refractive_index": 1.5}
+    few, many = (
+        np.asarray(
+            stokes_of(Scene(TwoBounceSurface(distribution, quadrature=rule)), material, geometry)
+        )[:, 0]
+        for rule in (FacetQuadrature(), FacetQuadrature(24, 20))
+    )
+    lit = many[:, 0] > 1e-6
+    assert np.sum(lit) > 30
+    error = np.abs(few - many)[lit] / many[lit, :1]
+    assert np.max(error) < 0.02
+    assert np.sqrt(np.mean(error[:, 0] ** 2)) < 0.005
+
+
+@each("shadowing", [SeparableShadowing(), HeightCorrelatedShadowing()])
+@each("slopes", [IsotropicSlopes(), AnisotropicSlopes(35.0)])
+def test_viewer_and_light_may_change_places(shadowing, slopes) -> None:
+    """Both bounces together, over the cosine of where light goes."""
+    there, parts = between_points(12, 3), {"shadowing": shadowing, "slopes": slopes}
+    scene = Scene(TwoBounceSurface(GGX(), **parts))
+    material = {"roughness": 0.2, "roughness_across": 0.5, "refractive_index": 1.5}
+    forth, back = (stokes_of(scene, material, each)[:, 0] for each in (there, there.reversed()))
+    cosines = np.cos(np.deg2rad([there.view_zenith, there.light_zenith]))
+    np.testing.assert_allclose(forth * cosines[0], back * cosines[1], rtol=1e-9)
 
 
 @pytest.mark.thorough
@@ -94,14 +193,14 @@ def test_a_sky_is_many_points(view: float) -> None:
     solid_angle = np.repeat(weight, azimuth.size) * 2.0 * np.pi / azimuth.size
     found = solid_angle @ second_bounce(parameters, geometry, illumination=PointSource())
     sky = second_bounce(parameters, seen_from(view), illumination=UniformSky())[0]
-    np.testing.assert_allclose(found, sky, rtol=0.03, atol=1e-6)
+    np.testing.assert_allclose(found, sky, rtol=0.03, atol=1e-6)  # the sky of 10 x 8
 
 
 @each("azimuth", [160.0, -140.0])
 def test_point_source_agrees_with_vectors(azimuth: float) -> None:
     """Both mirrors by explicit vectors and fields, on a grid of first facets.
 
-    Grid and quadrature are within 3% of their own limits: the steep facets that count here are few.
+    The grid is within 3% of its limit: the steep facets that count here are few.
     """
     view, light, roughness, n = (40.0, 0.0), (60.0, azimuth), 0.5, 1.5
     distribution = Beckmann()
@@ -141,8 +240,8 @@ def test_point_source_agrees_with_vectors(azimuth: float) -> None:
         view_zenith=[view[0]], view_azimuth=0.0, light_zenith=[light[0]], light_azimuth=azimuth
     )
     parameters = {"roughness": roughness, "refractive_index": n}
-    found = second_bounce(parameters, geometry, quadrature=FacetQuadrature(40, 40))[0]
-    np.testing.assert_allclose(found, total, rtol=0.04)
+    found = second_bounce(parameters, geometry)[0]
+    np.testing.assert_allclose(found, total, rtol=0.03)
 
 
 @pytest.mark.thorough

@@ -9,11 +9,17 @@ from physics.test_half_space import read
 
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
+from polar_bayes.physics.microfacet import AnisotropicSlopes
 from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.subsurface import TurbidMedium
-from polar_bayes.physics.surface import AbstractSurface, RoughSurface, SmoothSurface
+from polar_bayes.physics.surface import (
+    AbstractSurface,
+    RoughPassage,
+    RoughSurface,
+    SmoothSurface,
+)
 
 BODY = {"subsurface_fraction": 1.0, "absorption": 0.3, "refractive_index": 1.5, "roughness": 0.2}
 VIEWS = Geometry.from_degrees(
@@ -143,3 +149,27 @@ def test_without_internal_reflection_the_body_is_darker() -> None:
     with_it = stokes_of(body(), BODY, VIEWS)[:, 0]
     without = stokes_of(body(internal_reflection=None), BODY, VIEWS)[:, 0]
     assert np.all(with_it > 1.05 * without)
+
+
+def test_viewer_and_light_may_change_places_on_grooves() -> None:
+    """Grooves polarize what leaves along an axis of their own, and pass more of what agrees."""
+    random = np.random.default_rng(4)
+    zenith, azimuth = random.uniform(5.0, 85.0, (2, 8)), random.uniform(0.0, 360.0, (2, 8))
+    there = Geometry.from_degrees(
+        view_zenith=zenith[0],
+        view_azimuth=azimuth[0],
+        light_zenith=zenith[1],
+        light_azimuth=azimuth[1],
+    )
+    grooves = RoughSurface(slopes=AnisotropicSlopes(20.0), way_out=RoughPassage())
+    material = {
+        **BODY,
+        "roughness": 0.05,
+        "roughness_across": 0.8,
+        "absorption": 3.0,
+        "refractive_index": 1.45,
+    }
+    scene = body(grooves, polarized_fraction=1.0)
+    forth, back = (stokes_of(scene, material, each)[:, 0] for each in (there, there.reversed()))
+    cosine = np.cos(np.deg2rad(zenith))
+    np.testing.assert_allclose(forth * cosine[0], back * cosine[1], rtol=1e-12)
