@@ -18,6 +18,7 @@ from numpyro import distributions as dist
 from polar_bayes.errors import FitError, SceneError
 from polar_bayes.frames import PrintedFrame
 from polar_bayes.observation.links import AbstractLink, BetaLink, StokesLink, StudentTLink
+from polar_bayes.physics.illumination import PointSource
 from polar_bayes.physics.input_quantities import (
     AbstractInputQuantity,
     AmbientLight,

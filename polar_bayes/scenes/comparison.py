@@ -416,7 +416,8 @@ def _choose_layers(fits: _Fits, *, fringes: bool) -> tuple[set[str], list[str]]:
     def gain(name: str, other: str) -> tuple[float, float]:
         return _gain(fits.done[name], fits.done[other])
 
-    index = fits.done[base].view.result["posterior"].data_vars.get("refractive_index")
+    indices = fits.done[base].view.result["posterior"].data_vars.get("refractive_index")
+    index = None if indices is None else indices.to_numpy()
     layered = fit_layers([base])
     found = max(layered, key=lambda name: fits.done[name].elpd, default=base)
     if is_apart(*gain(found, base)):
