@@ -28,13 +28,7 @@ def tabulated() -> dict[str, dict[float, float]]:
         }
 
 
-def spectral_plate(
-    index: Mapping[float, float] | tuple[np.ndarray, np.ndarray],
-    *,
-    error: float,
-    seed: int,
-    views: np.ndarray = VIEWS,
-) -> xr.Dataset:
+def spectral_plate(index, *, error, seed, views=VIEWS):
     """A plate with normal errors of q in every color.
 
     Args:

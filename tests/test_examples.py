@@ -126,9 +126,7 @@ def settings_of_jax() -> Iterator[None]:
     ],
     ids=lambda page: page.name,
 )
-def test_the_python_of_a_page_runs(
-    page: Path, fits: Fits, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_python_of_a_page_runs(page, fits, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(pb, "fit", fits)
     namespace: dict[str, object] = {"__name__": page.stem}

@@ -163,8 +163,8 @@ def test_mistakes_are_told(capture: xr.Dataset) -> None:
 
 
 def test_a_long_calibration_says_how_long_and_what_a_faster_method_makes_of_it(
-    capture: xr.Dataset, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    capture, capsys, monkeypatch
+):
     monkeypatch.setattr(progress, "_write_line", [lambda text: sys.stderr.write(f"{text}\n")])
     asked = ASKED["model"], ASKED["scene"], None, ASKED["links"], 90.0, 0, "double"
     plan = make_plan(resolve(capture, *asked), None, pb.methods.Laplace(), False)

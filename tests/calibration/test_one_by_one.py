@@ -97,9 +97,7 @@ def test_a_model_that_is_too_sure_is_caught(capture: xr.Dataset) -> None:
 
 
 @pytest.mark.thorough
-def test_a_fit_does_not_depend_on_how_many_there_are(
-    capture: xr.Dataset, exact: xr.DataTree
-) -> None:
+def test_a_fit_does_not_depend_on_how_many_there_are(capture, exact):
     laplace = pb.methods.Laplace(draws=200, chains=1)
     few = pb.calibrate(capture, simulations=22, model=population, method=laplace, **ASKED)
     for group in ("truth", "prior_sbc", "marginals"):
@@ -121,9 +119,7 @@ def test_chains_that_are_too_short_are_ranked_and_not_trusted(capture: xr.Datase
 
 
 @pytest.mark.thorough
-def test_fits_without_draws_are_counted(
-    capture: xr.Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fits_without_draws_are_counted(capture, monkeypatch):
     """Whatever a fit raises for want of a peak: it is not left out, and has no rank."""
     inner = problem.CompiledModel.initializer.func
     refused = []

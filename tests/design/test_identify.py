@@ -106,9 +106,7 @@ def test_glass_does_not_tell_its_absorption(glass: xr.Dataset, of_glass: xr.Data
 
 
 @pytest.mark.thorough
-def test_the_papers_sum_is_that_of_slopes_and_concentrations(
-    glass: xr.Dataset, of_glass: xr.Dataset
-) -> None:
+def test_the_papers_sum_is_that_of_slopes_and_concentrations(glass, of_glass):
     """By differences, from the schedule as the paper prints it."""
     value = of_glass["value"]
     at = {name: float(value.sel(parameter=name)) for name in POLISHED.parameters}

@@ -91,11 +91,7 @@ OF_CALIBRATIONS = (
     lambda tree: pb.show(tree)._repr_html_(),
     lambda tree: pb.calibration.compare_calibrations({"this": tree, "that": CALIBRATION}),
 )
-OF_STUDIES = (
-    pb.summary,
-    pb.benchmark.accuracy_sentences,
-    lambda tree: pb.show(tree)._repr_html_(),
-)
+OF_STUDIES = (pb.summary, pb.benchmark.accuracy_sentences, lambda tree: pb.show(tree)._repr_html_())
 
 
 def check_mutations(trees, functions, random, count):
@@ -191,10 +187,7 @@ def test_provenance_that_is_no_mapping_is_refused(odd):
             {"prior_probability": {"roughness": ["x"]}},
             r"prior_probability.roughness\[0\]: it is 'x', not a number",
         ),
-        (
-            {"tails": {**TAILS, "ess": 0}},
-            "tails.ess: it is 0, not a number a",
-        ),
+        ({"tails": {**TAILS, "ess": 0}}, "tails.ess: it is 0, not a number a"),
         (
             {"tails": {**TAILS, "shares": {"a": [[0.1]]}}},
             r"tails.shares.a\[0\]: .*, not a share below",

@@ -177,9 +177,7 @@ def test_a_model_of_ones_own_with_a_known_posterior(capture: xr.Dataset) -> None
 
 @pytest.mark.thorough
 @each(("belief", "trusted"), [(dist.Normal(0.0, 1.0), True), (dist.StudentT(1.5, 0.0, 1.0), False)])
-def test_laplace_says_where_it_is_not_to_be_trusted(
-    capture: xr.Dataset, belief: dist.Distribution, trusted: bool
-) -> None:
+def test_laplace_says_where_it_is_not_to_be_trusted(capture, belief, trusted):
     """Tails heavier than normal have importance weights without a variance: Pareto k above 0.7."""
 
     def tails(data, scene, priors, links) -> None:
@@ -270,9 +268,7 @@ def test_the_capture_is_not_changed(capture: xr.Dataset) -> None:
         ({"largest_view_zenith": 22.0}, r"only 1 valid view up to 22 degrees; measure at two"),
     ],
 )
-def test_what_cannot_be_fitted_is_refused_with_the_mend(
-    capture: xr.Dataset, settings: dict, says: str
-) -> None:
+def test_what_cannot_be_fitted_is_refused_with_the_mend(capture, settings, says):
     arguments = {"scene": PLATE, "links": LINKS, **settings}
     with pytest.raises(pb.PolarBayesError, match=says) as caught:
         pb.fit(capture, **arguments)
@@ -317,9 +313,7 @@ def test_progress_reports_every_stage(capture: xr.Dataset) -> None:
 
 
 @pytest.mark.thorough
-def test_a_comparison_that_fails_is_told_and_costs_nothing(
-    capture: xr.Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_comparison_that_fails_is_told_and_costs_nothing(capture, monkeypatch):
     hold = Problem.hold
 
     def fails_without_gain(problem: Problem, values: dict[str, float]) -> Problem:

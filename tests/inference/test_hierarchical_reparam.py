@@ -107,9 +107,7 @@ def test_there_and_back_with_the_volume_of_the_map(made, seed: int) -> None:
     )
 
 
-def test_where_readings_are_normal_members_are_independent_of_their_population(
-    made, capture: xr.Dataset
-) -> None:
+def test_where_readings_are_normal_members_are_independent_of_their_population(made, capture):
     """Minus the log density is |w|^2/2 plus that of the population, members integrated out."""
     transport, data = made
     q = capture["q"].to_numpy()

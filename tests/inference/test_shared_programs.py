@@ -128,9 +128,7 @@ def test_a_key_of_a_draw_depends_on_its_place_alone() -> None:
 
 
 @pytest.mark.thorough
-def test_any_number_of_prior_draws_is_served_by_one_program(
-    compiled: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_any_number_of_prior_draws_is_served_by_one_program(compiled, monkeypatch):
     monkeypatch.setattr(programs, "BLOCK", 8)
     with jax.enable_x64(True):
         data = observe(one(1))
@@ -217,9 +215,7 @@ def test_the_same_question_shares_what_is_compiled(what: str) -> None:
 
 
 @pytest.mark.thorough
-def test_a_story_is_told_to_the_first_capture_of_a_layout_only(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_story_is_told_to_the_first_capture_of_a_layout_only(monkeypatch):
     told: list[tuple[int, ...]] = []
 
     def with_progress(model, data, *others) -> ModelInfo:
@@ -292,9 +288,7 @@ def load_anew(folder: Path, *edit: str) -> tuple[str, ...]:
     return *keys, cache_key(per_material, PLATE, {}, {"q": mine.Link()})
 
 
-def test_a_model_that_is_edited_and_loaded_again_is_another(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_model_that_is_edited_and_loaded_again_is_another(tmp_path, monkeypatch):
     """It has the same name as before, which is all that a pickle of it says."""
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     monkeypatch.syspath_prepend(str(tmp_path))

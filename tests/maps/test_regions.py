@@ -132,16 +132,12 @@ def test_regions_of_a_store_and_pixels_without_an_answer(maps: xr.Dataset, tmp_p
         (np.ones((SIDE, SIDE), int), 7, "no region has the label 7; give one of 1"),
     ],
 )
-def test_labels_that_do_not_fit_are_refused(
-    maps: xr.Dataset, labels: np.ndarray, against: object, what: str
-) -> None:
+def test_labels_that_do_not_fit_are_refused(maps, labels, against, what):
     with pytest.raises(pb.FitError, match=what):
         pb.maps.region_means(maps, labels, against=against)
 
 
-def test_the_command_reads_labels_from_a_picture(
-    maps: xr.Dataset, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_the_command_reads_labels_from_a_picture(maps, tmp_path, capsys):
     store, picture = tmp_path / "map.zarr", tmp_path / "labels.png"
     maps.to_zarr(store, consolidated=False)
     Image.fromarray(np.uint8(quarters())).save(picture)
@@ -169,9 +165,7 @@ def test_a_parameter_of_several_values_has_a_row_for_each() -> None:
     ("mode", "what"),
     [("RGB", "not gray values"), ("F", "and type float32"), (None, "cannot be read")],
 )
-def test_pictures_that_are_no_labels_are_refused(
-    tmp_path: Path, mode: str | None, what: str
-) -> None:
+def test_pictures_that_are_no_labels_are_refused(tmp_path, mode, what):
     file = tmp_path / "labels.tiff"
     if mode is None:
         file.write_text("no picture")

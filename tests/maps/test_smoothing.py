@@ -69,9 +69,7 @@ def test_a_wide_prior_leaves_a_map_as_it_is(maps: xr.Dataset) -> None:
         (NAME, 0.0, "neighbor_sd is 0.0; give a number above 0 in the unit of refractive_index"),
     ],
 )
-def test_what_cannot_be_smoothed_is_refused(
-    maps: xr.Dataset, name: str, neighbor_sd: float, what: str
-) -> None:
+def test_what_cannot_be_smoothed_is_refused(maps, name, neighbor_sd, what):
     with pytest.raises(pb.FitError, match=what):
         pb.maps.smooth(maps, name, neighbor_sd)
 

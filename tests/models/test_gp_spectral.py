@@ -190,10 +190,7 @@ def test_the_posterior_is_that_of_another_density_and_another_sampler() -> None:
 
 # --- hard wavelengths -----------------------------------------------------------------------------
 
-HARD_COLORS = {
-    "two equal": np.array([550.0, 550.0]),
-    "two hundred": np.linspace(400.0, 800.0, 200),
-}
+HARD_COLORS = {"two equal": np.array([550.0, 550.0]), "two hundred": np.linspace(400.0, 800.0, 200)}
 
 
 @pytest.mark.thorough

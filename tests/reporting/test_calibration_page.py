@@ -43,15 +43,9 @@ def test_the_folder_holds_page_and_calibration(tmp_path: Path, broken: xr.DataTr
 def test_arguments_that_do_not_apply_are_refused(tmp_path: Path, good: xr.DataTree) -> None:
     fit = make_result(wavelengths=(), views=2, draws=10, variables=("dop",))
     for asked, says in (
-        (
-            (fit, {"comparisons": {"laplace": good}}),
-            "comparisons: it goes with calibrations only",
-        ),
+        ((fit, {"comparisons": {"laplace": good}}), "comparisons: it goes with calibrations only"),
         ((good, {"truth": xr.Dataset()}), "report: truth: it goes with maps only"),
-        (
-            (good, {"comparisons": {"laplace": fit}}),
-            "comparisons, laplace: it is no calibration",
-        ),
+        ((good, {"comparisons": {"laplace": fit}}), "comparisons, laplace: it is no calibration"),
         ((good, {"comparisons": {"importance": good}}), "give it another name"),
         ((good, {"comparisons": {f"{at}": good for at in range(5)}}), "too many for one figure"),
         (
@@ -104,8 +98,7 @@ def test_dots_mark_where_the_curve_leaves_its_band(broken: xr.DataTree) -> None:
 
 
 @each(
-    "method",
-    {"laplace": "method='nuts'", "importance": "method='nuts'", "nuts": "longer"}.items(),
+    "method", {"laplace": "method='nuts'", "importance": "method='nuts'", "nuts": "longer"}.items()
 )
 def test_where_half_of_the_fits_fail_a_better_method_is_named(method) -> None:
     name, advice = method
@@ -119,9 +112,7 @@ def test_where_half_of_the_fits_fail_a_better_method_is_named(method) -> None:
     assert "Half of the fits" not in few
 
 
-def test_a_page_checks_its_calibration_once_and_computes_its_table_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_page_checks_its_calibration_once_and_computes_its_table_once(monkeypatch):
     tree, checked, rows = make_calibration(readings={"dop": 1.0}), [], []
     check, row = verdict.check_calibration, verdict._parameter_row
 

@@ -13,12 +13,7 @@ from synthetic_results import edit_provenance, make_result, replace
 from polar_bayes.diagnostics.view import view_of
 from polar_bayes.errors import FitError
 from polar_bayes.reporting import plots_fit
-from polar_bayes.reporting.plots_curves import (
-    curves,
-    minus_center,
-    plot_readings,
-    plot_residuals,
-)
+from polar_bayes.reporting.plots_curves import curves, minus_center, plot_readings, plot_residuals
 
 CASES = {
     "three wavelengths, four azimuths": {"azimuths": (180.0, 150.0, 120.0, 60.0)},
