@@ -3,7 +3,7 @@
 import numpy as np
 import xarray as xr
 from numpyro import handlers
-from plates import PLATE
+from plates import PLATE, at_mirror
 from scipy import stats
 from textbook import plate_q
 
@@ -44,18 +44,14 @@ def plate_image(rows, columns, *, noise=NOISE, views=VIEWS, seed=0):
     fraction = stats.beta(2.0, 2.0).rvs(shape, random_state=rng)
     q = plate_q(index[..., None], fraction[..., None], np.radians(views))
     error = np.broadcast_to(np.broadcast_to(noise, shape)[..., None], q.shape)
-    geometry = {"view_zenith": views, "view_azimuth": np.full(views.size, 180.0)}
-    geometry |= {"light_zenith": views, "light_azimuth": np.zeros(views.size)}
-    return xr.Dataset(
-        {name: ("view", angle) for name, angle in geometry.items()}
-        | {
-            "q": (("y", "x", "view"), np.clip(q + error * rng.normal(size=q.shape), -1.0, 1.0)),
-            "q_error": (("y", "x", "view"), error.copy()),
-            "true_refractive_index": (("y", "x"), index),
-            "true_subsurface_fraction": (("y", "x"), fraction),
-        },
-        attrs={"name": "plates"},
+    found = at_mirror(
+        views,
+        q=(("y", "x", "view"), np.clip(q + error * rng.normal(size=q.shape), -1.0, 1.0)),
+        q_error=(("y", "x", "view"), error.copy()),
+        true_refractive_index=(("y", "x"), index),
+        true_subsurface_fraction=(("y", "x"), fraction),
     )
+    return found.assign_attrs(name="plates")
 
 
 def on_a_grid(q, error, views):

@@ -30,20 +30,6 @@ def weighted(image: xr.Dataset, compiled_in_haste: None) -> xr.Dataset:
     return pb.fit_pixels(image, method="importance", **ASKED)
 
 
-@pytest.mark.thorough
-def test_chains_in_every_pixel_make_a_map(image: xr.Dataset, weighted: xr.Dataset) -> None:
-    chains = pb.fit_pixels(image.isel(y=[0], x=[0, 1]), method=pb.methods.Nuts(), **ASKED)
-    assert (chains["method"] == MethodUsed.NUTS).all()
-    assert (chains["status"] == Status.GOOD).all()
-    for name in NAMES:
-        one, other = chains[name].values[0], weighted[name].values[0, :2]
-        worth = 1.0 / chains["ess"].values[0]
-        worth += 1.0 / weighted["ess"].values[0, :2]
-        # Four standard normals, in two pairs: the largest is above 4 in 3 of ten thousand cases.
-        error = weighted[f"{name}_sd"].values[0, :2] * np.sqrt(worth)
-        assert (np.abs(one - other) < 4.0 * error).all()
-
-
 class OneByOne(pb.methods.Importance):
     """The same settings, for one pixel after another."""
 
@@ -122,13 +108,3 @@ def test_the_map_says_how_it_was_made(weighted: xr.Dataset, tmp_path: Path) -> N
     assert "importance sampling from mixtures at all modes" in page
     assert len(METHODS_USED) == len(MethodUsed)  # each has a color
     assert "all by weighted draws of normal approximations" in page
-
-
-@pytest.mark.thorough
-def test_files_give_the_same_map(image: xr.Dataset, weighted: xr.Dataset, tmp_path: Path) -> None:
-    image.to_zarr(tmp_path / "image.zarr", consolidated=False)
-    stored = pb.maps.map_file(
-        tmp_path / "image.zarr", tmp_path / "map.zarr", method="importance", **ASKED
-    )
-    for name in weighted.data_vars:
-        np.testing.assert_array_equal(stored[name], weighted[name], err_msg=str(name))

@@ -321,16 +321,3 @@ def test_what_cannot_be_mapped_is_refused_with_the_mend(change, settings: dict, 
     with pytest.raises(pb.PolarBayesError, match=says) as caught:
         fit_pixels(change(image), **{**ASKED, **settings})
     assert "\n" not in str(caught.value)
-
-
-@each(
-    ("setting", "says"),
-    [
-        ({"draws": 100}, "draws is 100; give 64, 128, 256 or so"),
-        ({"draws": 32}, "draws is 32; give 64, 128, 256 or so"),
-        ({"candidates": 2}, "candidates is 2; give at least 8"),
-    ],
-)
-def test_settings_outside_their_range_are_refused(setting: dict, says: str) -> None:
-    with pytest.raises(pb.FitError, match=f"CorrectedLaplace: {says}"):
-        CorrectedLaplace(**setting)

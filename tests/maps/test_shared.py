@@ -1,6 +1,5 @@
 """Parameters that all pixels of an image share: one unknown of the whole image."""
 
-
 import numpy as np
 import pytest
 import xarray as xr

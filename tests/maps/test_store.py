@@ -274,15 +274,6 @@ def test_a_store_that_is_broken_is_refused(capture: Path, tmp_path: Path) -> Non
         mapped(tmp_path / "nowhere.zarr", tmp_path / "map.zarr")
 
 
-@pytest.mark.thorough
-def test_a_broken_chunk_of_a_capture_is_one_line(capture: Path, tmp_path: Path) -> None:
-    source = copied(capture, tmp_path / "plates.zarr")
-    (source / "q_error" / "c" / "2" / "0" / "0").write_bytes(b"\x28\xb5")
-    says = r"plates\.zarr: q_error\[y=[68]:[89], x=0:20\]: it cannot be read"
-    with pytest.raises(pb.CaptureError, match=says):
-        mapped(source, tmp_path / "map.zarr")
-
-
 def test_a_reading_that_cannot_be_is_named_with_its_block(capture: Path, tmp_path: Path) -> None:
     source = copied(capture, tmp_path / "plates.zarr")
     changed = xr.open_zarr(source, chunks=None, consolidated=False)[["q"]].load()

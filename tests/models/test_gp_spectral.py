@@ -15,8 +15,9 @@ from arviz_stats.base import array_stats
 from cases import each
 from jax.flatten_util import ravel_pytree
 from numpyro import distributions as dist
+from plates import LINKS, PLATE
 from scipy import stats
-from spectral_plates import FRACTION, LINKS, PLATE, spectral_plate, tabulated
+from spectral_plates import FRACTION, spectral_plate, tabulated
 from textbook import mirror_and_body
 from tinygp import kernels
 

@@ -33,13 +33,6 @@ def broken() -> xr.DataTree:
     return make_calibration(**wrong, failed=FAILED, method="laplace")
 
 
-def test_the_folder_holds_page_and_calibration(tmp_path: Path, broken: xr.DataTree) -> None:
-    page = pb.report(broken, tmp_path / "report")
-    assert sorted(path.name for path in page.parent.iterdir()) == ["calibration.nc", "index.html"]
-    read = pb.load(page.parent / "calibration.nc")
-    assert render(read) == page.read_text()
-
-
 def test_arguments_that_do_not_apply_are_refused(tmp_path: Path, good: xr.DataTree) -> None:
     fit = make_result(wavelengths=(), views=2, draws=10, variables=("dop",))
     for asked, says in (

@@ -22,7 +22,6 @@ from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.reporting import fit_page
 from polar_bayes.reporting.report import render, report
 from polar_bayes.reporting.text import interval, join, numbers, overconfidence, percent
-from polar_bayes.results import load
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -152,19 +151,6 @@ def test_the_first_screen_tells_the_index_the_trust_and_the_next_views(small) ->
     ) in Page(render(told)).text
     told["next_views"] = told["next_views"].to_dataset().assign_coords(parameter=["a", "b"])
     assert "the 95% intervals are expected to narrow by 0% to 75%." in Page(render(told)).text
-
-
-def test_the_folder_holds_page_and_result_and_nothing_else(tmp_path: Path) -> None:
-    result, folder = make_result(**SMALL), tmp_path / "deep" / "er"
-    folder.mkdir(parents=True)
-    report(make_result(**SMALL, seed=5), folder)  # an older report is replaced
-    assert report(result, folder) == folder / "index.html"
-    assert sorted(path.name for path in folder.iterdir()) == ["index.html", "result.nc"]
-    assert (folder / "index.html").read_text().startswith("<!DOCTYPE html>")
-    # What was written gives the same numbers and the same page, byte for byte.
-    read = load(folder / "result.nc")
-    pd.testing.assert_frame_equal(summary(read), summary(result))
-    assert render(read) == (folder / "index.html").read_text()
 
 
 @pytest.mark.thorough
