@@ -19,17 +19,9 @@ from polar_bayes.scenes.neighbors import STOPPED
 
 SHORT = pb.methods.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50)
 GROUPS = {
-    "posterior",
-    "sample_stats",
-    "log_likelihood",
-    "log_prior",
-    "posterior_predictive",
-    "noise_free",
-    "prior",
-    "prior_predictive",
-    "observed_data",
-    "constant_data",
-}
+    "posterior", "sample_stats", "log_likelihood", "log_prior", "posterior_predictive",
+    "noise_free", "prior", "prior_predictive", "observed_data", "constant_data",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -161,24 +161,20 @@ def test_a_parameter_of_several_values_has_a_row_for_each() -> None:
     assert table["pixels"].tolist() == [12, 12]
 
 
-@pytest.mark.parametrize(
-    ("mode", "what"),
-    [("RGB", "not gray values"), ("F", "and type float32"), (None, "cannot be read")],
-)
-def test_pictures_that_are_no_labels_are_refused(tmp_path, mode, what):
-    file = tmp_path / "labels.tiff"
-    if mode is None:
-        file.write_text("no picture")
-    else:
-        Image.new(mode, (4, 3)).save(file)
+NO_LABELS = {
+    "not gray values": lambda file: Image.new("RGB", (4, 3)).save(file),
+    "and type float32": lambda file: Image.new("F", (4, 3)).save(file),
+    "cannot be read": lambda file: file.write_text("no picture"),
+    "and type float64": lambda file: np.save(file, np.ones((3, 4))),
+}
+
+
+@pytest.mark.parametrize("what", NO_LABELS)
+def test_files_that_are_no_labels_are_refused(tmp_path: Path, what: str) -> None:
+    file = tmp_path / ("labels.npy" if "float64" in what else "labels.tiff")
+    NO_LABELS[what](file)
     with pytest.raises(pb.CaptureError, match=what):
         pb.maps.load_labels(file)
-
-
-def test_an_array_of_no_labels_is_refused(tmp_path: Path) -> None:
-    np.save(tmp_path / "labels.npy", np.ones((3, 4)))
-    with pytest.raises(pb.CaptureError, match="and type float64"):
-        pb.maps.load_labels(tmp_path / "labels.npy")
 
 
 def test_what_is_no_map_has_no_regions(image: xr.Dataset) -> None:

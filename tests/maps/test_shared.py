@@ -98,20 +98,16 @@ def test_masked_pixels_say_nothing_about_what_is_shared(image: xr.Dataset) -> No
 
 
 @pytest.mark.parametrize(
-    ("shared", "what"),
+    ("columns", "shared", "what"),
     [
-        ("refractive_index", "shared='refractive_index': an image cannot share it"),
-        (("stokes_eror_factor",), "give names among stokes_error_factor"),
+        (SIDE, "refractive_index", "shared='refractive_index': an image cannot share it"),
+        (SIDE, ("stokes_eror_factor",), "give names among stokes_error_factor"),
+        (1, SHARED, f"only {SIDE} pixels have an answer"),
     ],
 )
-def test_what_cannot_be_shared_is_refused(image: xr.Dataset, shared: object, what: str) -> None:
+def test_what_cannot_be_shared_is_refused(image, columns: int, shared: object, what: str) -> None:
     with pytest.raises(pb.FitError, match=what):
-        pb.fit_pixels(image, scene=PLATE, links=LINKS, shared=shared)
-
-
-def test_too_few_pixels_are_an_error(image: xr.Dataset) -> None:
-    with pytest.raises(pb.FitError, match="only 20 pixels have an answer"):
-        pb.fit_pixels(image.isel(y=slice(4), x=slice(5)), scene=PLATE, links=LINKS, shared=SHARED)
+        pb.fit_pixels(image.isel(x=slice(columns)), scene=PLATE, links=LINKS, shared=shared)
 
 
 SETUP = pb.setups.Setup(PLATE, LINKS, priors=pb.setups.SETUPS["paper"].priors, shared=SHARED)

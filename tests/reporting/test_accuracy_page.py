@@ -12,12 +12,6 @@ pytestmark = pytest.mark.usefixtures("unpainted")
 
 
 @pytest.mark.thorough
-def test_arguments_that_do_not_apply_are_refused(tmp_path):
-    with pytest.raises(pb.FitError, match="it goes with calibrations only"):
-        pb.report(make_accuracy(), tmp_path / "other", comparisons={})
-
-
-@pytest.mark.thorough
 def test_every_rung_as_given_is_named_and_nothing_is_cut_off():
     figure = pb.plots.plot_accuracy(make_accuracy())
     assert len(figure.axes) == 2

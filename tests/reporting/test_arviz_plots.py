@@ -27,17 +27,9 @@ FIRST = ("plot_forest", "plot_ppc_pit", "plot_loo_pit", "plot_psense_dist", "plo
 """One of each group that a plot reads."""
 
 OF_DRAWS = (
-    "plot_dist",
-    "plot_pair",
-    "plot_ppc_dist",
-    "plot_ppc_interval",
-    "plot_prior_posterior",
-    "plot_trace",
-    "plot_trace_dist",
-    "plot_autocorr",
-    "plot_ess",
-    *FIRST,
-)
+    "plot_dist", "plot_pair", "plot_ppc_dist", "plot_ppc_interval", "plot_prior_posterior",
+    "plot_trace", "plot_trace_dist", "plot_autocorr", "plot_ess", *FIRST,
+)  # fmt: skip
 OF_AN_ESTIMATE = ("plot_dist", "plot_forest", "plot_pair", "plot_ppc_interval", "plot_trace_dist")
 
 

@@ -18,7 +18,7 @@ from polar_bayes.diagnostics.compare import compare_without
 from polar_bayes.diagnostics.convergence import Verdict, summary, verdict
 from polar_bayes.diagnostics.criticism import criticize
 from polar_bayes.diagnostics.view import FitView, view_of
-from polar_bayes.errors import FitError, PolarBayesError
+from polar_bayes.errors import PolarBayesError
 from polar_bayes.reporting import fit_page
 from polar_bayes.reporting.report import render, report
 from polar_bayes.reporting.text import interval, join, numbers, overconfidence, percent
@@ -161,13 +161,6 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
             report(make_result(**SMALL, method="point"), place)
         assert "\n" not in str(error.value)
         assert str(place) in str(error.value)
-
-
-@each("wrong", [None, xr.DataTree(), "fit.nc"])
-def test_what_is_no_result_leaves_no_folder(tmp_path: Path, wrong: object) -> None:
-    with pytest.raises(FitError, match="it holds no fit"):
-        report(wrong, tmp_path / "report")
-    assert not (tmp_path / "report").exists()
 
 
 def test_numbers_as_text() -> None:
