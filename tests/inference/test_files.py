@@ -429,16 +429,6 @@ def test_a_flipped_bit_is_an_error_and_no_value(tmp_path, part):
         pb.load(tmp_path / "damaged.nc")
 
 
-@pytest.mark.thorough
-def test_a_result_edited_elsewhere_has_no_checksum(tmp_path):
-    pb.save(RESULTS[1], tmp_path / "fit.nc")
-    with xr.open_datatree(tmp_path / "fit.nc", engine="netcdf4") as opened:
-        tree = opened.load()
-    del tree["prior"]
-    tree.to_netcdf(tmp_path / "edited.nc", engine="netcdf4")
-    assert "prior" not in pb.load(tmp_path / "edited.nc").children
-
-
 def test_a_result_is_no_capture(tmp_path):
     pb.save(RESULTS[1], tmp_path / "fit.nc")
     with pytest.raises(pb.CaptureError, match=r"fit\.nc: view_zenith: it is missing"):
