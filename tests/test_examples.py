@@ -103,7 +103,7 @@ def rehearse(capture: xr.Dataset, asked: dict[str, object]) -> None:
 quickly = contextlib.contextmanager(compiled_fast)
 
 
-IN_FULL, OF_A_PLATE = Fits(), Fits(scene=PLATE)
+IN_FULL, OF_A_PLATE = Fits(), Fits(scene=PLATE, links={"dop": pb.links.NormalLink()})
 
 
 @pytest.fixture

@@ -42,7 +42,13 @@ def fit(capture: xr.Dataset) -> xr.DataTree:
     return pb.fit(capture, scene=setup(*KNOWN), **ASKED)
 
 
-@each("quantity", KNOWN, ids=lambda quantity: quantity.name)
+@pytest.mark.parametrize(
+    "quantity",
+    [
+        pytest.param(x, id=x.name, marks=[pytest.mark.thorough] if x in KNOWN[2:] else [])
+        for x in KNOWN
+    ],
+)
 def test_a_contribution_is_the_change_that_other_fits_give(
     fit: xr.DataTree, capture: xr.Dataset, quantity: pb.input_quantities.AbstractInputQuantity
 ) -> None:

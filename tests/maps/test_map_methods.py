@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from plate_images import ASKED, NAMES, NOISE, VIEWS, on_a_grid, planned, plate_image
 from toy_models import BEND, bent, squared
 
@@ -36,9 +37,8 @@ class OneByOne(pb.methods.Importance):
     run_batch = AbstractMethod.run_batch
 
 
-@pytest.mark.parametrize(
-    "kind", [pytest.param(OneByOne, marks=pytest.mark.thorough), pb.methods.Importance]
-)
+@pytest.mark.thorough
+@each("kind", [OneByOne, pb.methods.Importance])
 def test_importance_sampling_makes_a_map(image: xr.Dataset, kind: type) -> None:
     method = kind(draws=1024)
     some = image.isel(y=[0, 1], x=[0, 1])
