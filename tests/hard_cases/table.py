@@ -205,39 +205,39 @@ CASES = (
     Case("89.9999 degrees", "transmittance", (89.9999, 1.5), transmitted, our_transmittance),
     Case("0.01 degrees", "contrast of s and p", (0.01, 1.5), contrast, our_contrast),
     Case(
-        *("0.01 degrees", "contrast under a clear coat", (0.01, 1.7)),
-        *(coated_contrast, our_coated_contrast),
+        "0.01 degrees", "contrast under a clear coat", (0.01, 1.7),
+        coated_contrast, our_coated_contrast,
     ),
     Case(
-        *("0.0001 degrees from the mirror direction", "squared slope of the facet"),
-        *((45.0001, 45.0), tilt, our_tilt),
+        "0.0001 degrees from the mirror direction", "squared slope of the facet", (45.0001, 45.0),
+        tilt, our_tilt,
     ),
     Case(
-        *("roughness 0.05, slope 1", "log density of facets", (1.0, 0.05)),
-        *(lambda t, r: jnp.log(density(t, r)), our_log_density, None),
+        "roughness 0.05, slope 1", "log density of facets", (1.0, 0.05),
+        lambda t, r: jnp.log(density(t, r)), our_log_density, None,
     ),
     Case(
-        *("viewer = light", "u of reflected light, u = 0.5 coming in", (30.0, 1.5)),
-        *(retroreflected, our_retroreflected, exactly("0.5")),
+        "viewer = light", "u of reflected light, u = 0.5 coming in", (30.0, 1.5),
+        retroreflected, our_retroreflected, exactly("0.5"),
     ),
     Case(
-        *("no light", "degree of polarization", (0.0, 0.0)),
-        *(lambda q, u: 1e-12 + jnp.sqrt(q**2 + u**2), degree_of_linear_polarization),
+        "no light", "degree of polarization", (0.0, 0.0),
+        lambda q, u: 1e-12 + jnp.sqrt(q**2 + u**2), degree_of_linear_polarization,
         exactly("1e-12"),
     ),
     Case(
-        *("fraction 0 of no surface light", "1 + share of the surface", (0.0, 0.0)),
-        *(lambda f, s: 1.0 + (1 - f) * s / ((1 - f) * s + f), our_share, None),
+        "fraction 0 of no surface light", "1 + share of the surface", (0.0, 0.0),
+        lambda f, s: 1.0 + (1 - f) * s / ((1 - f) * s + f), our_share, None,
     ),
     Case(
-        *("concentration 1e8", "Beta log density", (0.3, 1e8, 0.30005)),
-        *(beta_density, our_beta_density),
+        "concentration 1e8", "Beta log density", (0.3, 1e8, 0.30005),
+        beta_density, our_beta_density,
     ),
     Case(
-        *("reading at full scale", "scale of intensity noise", (0.02, 1.0, 0.5)),
-        *(lambda b, i, c: b * (1 - i) ** -0.5 * c**-0.5, ScaleSchedule().scale, None),
+        "reading at full scale", "scale of intensity noise", (0.02, 1.0, 0.5),
+        lambda b, i, c: b * (1 - i) ** -0.5 * c**-0.5, ScaleSchedule().scale, None,
     ),
-)
+)  # fmt: skip
 
 
 HEADER = (
