@@ -34,9 +34,7 @@ def _value_name(value: Any, ids: Names) -> str:
     return readable.encode(errors="backslashreplace").decode()  # workers send names as UTF-8
 
 
-def _cases(
-    names: str | Sequence[str], values: Iterable, ids: Names
-) -> list[tuple[str, dict[str, Any]]]:
+def _cases(names, values, ids):
     """Name and arguments of every case."""
     single = isinstance(names, str) and "," not in names
     arguments = [n.strip() for n in names.split(",")] if isinstance(names, str) else names

@@ -4,7 +4,6 @@ import contextlib
 from collections.abc import Iterator
 
 import jax
-import pytest
 
 
 @contextlib.contextmanager
@@ -22,9 +21,7 @@ def compilations() -> Iterator[list[str]]:
     jax.monitoring.unregister_event_duration_listener(listen)
 
 
-def compiled_fast(
-    monkeypatch: pytest.MonkeyPatch, *, starts: int, typical: int, draws: int, block: int
-) -> Iterator[None]:
+def compiled_fast(monkeypatch, *, starts, typical, draws, block):
     """What a fixture yields from where programs are compiled more often than they run."""
     numbers = {
         "inference.initialization.STARTS": starts,

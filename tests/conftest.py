@@ -29,6 +29,14 @@ def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
+@pytest.fixture(scope="module")
+def compiled_in_haste() -> Iterator[None]:
+    """For tests whose programs are compiled more often than they run."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
 @pytest.fixture(scope="session")
 def measured() -> Path:
     """Folder of real measurements, which is not part of the project."""

@@ -3,7 +3,7 @@
 import numpy as np
 import xarray as xr
 from numpyro import handlers
-from plates import PLATE
+from plates import PLATE, at_mirror
 from scipy import stats
 from textbook import plate_q
 
@@ -18,7 +18,6 @@ from polar_bayes.maps.fit_map import (
     plan_map,
     with_pixel_numbers,
 )
-from polar_bayes.methods.corrected_laplace import CorrectedLaplace
 from polar_bayes.models.per_material import per_material
 
 NOISE = 0.02
@@ -36,14 +35,7 @@ ASKED = {
 }
 
 
-def plate_image(
-    rows: int,
-    columns: int,
-    *,
-    noise: float | np.ndarray = NOISE,
-    views: np.ndarray = VIEWS,
-    seed: int = 0,
-) -> xr.Dataset:
+def plate_image(rows, columns, *, noise=NOISE, views=VIEWS, seed=0):
     """Every pixel is a plate of its own; `noise` is one number or (rows, columns)."""
     rng = np.random.default_rng(seed)
     low, high = (1.2 - 1.45) / 0.15, (2.0 - 1.45) / 0.15
@@ -52,23 +44,17 @@ def plate_image(
     fraction = stats.beta(2.0, 2.0).rvs(shape, random_state=rng)
     q = plate_q(index[..., None], fraction[..., None], np.radians(views))
     error = np.broadcast_to(np.broadcast_to(noise, shape)[..., None], q.shape)
-    geometry = {"view_zenith": views, "view_azimuth": np.full(views.size, 180.0)}
-    geometry |= {"light_zenith": views, "light_azimuth": np.zeros(views.size)}
-    return xr.Dataset(
-        {name: ("view", angle) for name, angle in geometry.items()}
-        | {
-            "q": (("y", "x", "view"), np.clip(q + error * rng.normal(size=q.shape), -1.0, 1.0)),
-            "q_error": (("y", "x", "view"), error.copy()),
-            "true_refractive_index": (("y", "x"), index),
-            "true_subsurface_fraction": (("y", "x"), fraction),
-        },
-        attrs={"name": "plates"},
+    found = at_mirror(
+        views,
+        q=(("y", "x", "view"), np.clip(q + error * rng.normal(size=q.shape), -1.0, 1.0)),
+        q_error=(("y", "x", "view"), error.copy()),
+        true_refractive_index=(("y", "x"), index),
+        true_subsurface_fraction=(("y", "x"), fraction),
     )
+    return found.assign_attrs(name="plates")
 
 
-def on_a_grid(
-    q: np.ndarray, error: float, views: np.ndarray
-) -> dict[str, tuple[float, float, float]]:
+def on_a_grid(q, error, views):
     """Mean, sd and skewness of each parameter, by adding up 800 x 800 cells."""
     cells = (np.arange(800) + 0.5) / 800
     index, fraction = np.meshgrid(1.2 + 0.8 * cells, cells, indexing="ij")
@@ -85,14 +71,7 @@ def on_a_grid(
     return found
 
 
-def planned(
-    capture: xr.Dataset,
-    method: CorrectedLaplace | None = None,
-    *,
-    seed: int = 0,
-    precision: str = "double",
-    **asked,
-) -> MapPlan:
+def planned(capture, method=None, *, seed=0, precision="double", **asked):
     """The plan of a map; with one plan, the same programs serve many tests."""
     given = {**ASKED, **asked}
     scene, links = given["scene"], given["links"]

@@ -17,23 +17,28 @@ GONIOMETER_VIEWS = np.arange(12.0, 79.0, 3.0)
 VIEWS = np.linspace(35.0, 75.0, 6)
 
 
+def at_mirror(zeniths, **variables) -> xr.Dataset:
+    """Views in the mirror direction of a light that moves along, and what was read there."""
+    zeniths = np.asarray(zeniths, float)
+    angles = {"view_zenith": zeniths, "view_azimuth": np.full(zeniths.size, 180.0)}
+    angles |= {"light_zenith": zeniths, "light_azimuth": np.zeros(zeniths.size)}
+    columns = {
+        name: values if isinstance(values, tuple) else ("view", np.asarray(values))
+        for name, values in (angles | variables).items()
+    }
+    return xr.Dataset(columns)
+
+
 def plates(index, error, views=VIEWS, fraction=0.02, seed=0) -> xr.Dataset:
     """Smooth plates of their own index, with normal errors of q."""
     rng = np.random.default_rng(seed)
     index = np.asarray(index, float)
     q = plate_q(index[:, None], fraction, np.radians(views))
     q = np.clip(q + error * rng.normal(size=q.shape), -1.0, 1.0)
-    geometry = {"view_zenith": views, "view_azimuth": np.full(views.size, 180.0)}
-    geometry |= {"light_zenith": views, "light_azimuth": np.zeros(views.size)}
-    return xr.Dataset(
-        {name: ("view", angle) for name, angle in geometry.items()}
-        | {
-            "q": (("patch", "view"), q),
-            "q_error": (("patch", "view"), np.full(q.shape, error)),
-            "true_refractive_index": ("patch", index),
-        },
-        attrs={"name": "plates"},
+    found = at_mirror(
+        views, q=(("patch", "view"), q), q_error=(("patch", "view"), np.full(q.shape, error))
     )
+    return found.assign(true_refractive_index=("patch", index)).assign_attrs(name="plates")
 
 
 def plate_capture(zeniths: np.ndarray, error: float, seed: int) -> xr.Dataset:

@@ -5,14 +5,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import xarray as xr
+from plates import at_mirror
 from textbook import plate_q
 
-import polar_bayes as pb
-
-# The plate of tests/plates.py: one color more.
-PLATE = pb.Scene(surface=pb.SmoothSurface(), subsurface=pb.Unpolarized(), mixing=pb.StokesMixing())
-LINKS = {"q": pb.links.StokesLink(stated_errors=True)}
 FRACTION = 0.02
 VIEWS = np.linspace(30.0, 78.0, 12)
 
@@ -28,13 +23,7 @@ def tabulated() -> dict[str, dict[float, float]]:
         }
 
 
-def spectral_plate(
-    index: Mapping[float, float] | tuple[np.ndarray, np.ndarray],
-    *,
-    error: float,
-    seed: int,
-    views: np.ndarray = VIEWS,
-) -> xr.Dataset:
+def spectral_plate(index, *, error, seed, views=VIEWS):
     """A plate with normal errors of q in every color.
 
     Args:
@@ -46,20 +35,11 @@ def spectral_plate(
     if isinstance(index, Mapping):
         index = (np.array(list(index)), np.array(list(index.values())))
     wavelengths, values = (np.asarray(part, float) for part in index)
-    angles = {
-        "view_zenith": views,
-        "view_azimuth": np.full(views.size, 180.0),
-        "light_zenith": views,
-        "light_azimuth": np.zeros(views.size),
-    }
     q = plate_q(values[:, None], FRACTION, np.radians(views))
     noise = np.random.default_rng(seed).normal(0.0, error, q.shape)
-    return xr.Dataset(
-        {name: ("view", angle) for name, angle in angles.items()}
-        | {
-            "q": (("view", "wavelength"), np.clip(q + noise, -1.0, 1.0).T),
-            "q_error": (("view", "wavelength"), np.full(q.T.shape, error)),
-        },
-        coords={"wavelength": wavelengths},
-        attrs={"name": "plate"},
+    found = at_mirror(
+        views,
+        q=(("view", "wavelength"), np.clip(q + noise, -1.0, 1.0).T),
+        q_error=(("view", "wavelength"), np.full(q.T.shape, error)),
     )
+    return found.assign_coords(wavelength=wavelengths).assign_attrs(name="plate")

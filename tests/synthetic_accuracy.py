@@ -17,12 +17,7 @@ ROWS = {
 """By method and override: errors of the means, and seconds of the first fit and the next."""
 
 
-def make_accuracy(
-    rows: dict[tuple[str, str], tuple[list[float], float, float]] | None = None,
-    *,
-    fresh: bool = True,
-    doubts: str = "",
-) -> xr.DataTree:
+def make_accuracy(rows=None, *, fresh=True, doubts=""):
     """A study; all errors but those of the means are half of these, with the other sign."""
     rows = ROWS if rows is None else rows
     error = np.array([errors for errors, *_ in rows.values()], float)

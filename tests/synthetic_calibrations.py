@@ -15,16 +15,16 @@ NAMES = ("roughness", "subsurface_fraction", "refractive_index")
 
 def make_calibration(
     *,
-    names: tuple[str, ...] = NAMES,
-    narrow: dict[str, float] | None = None,
-    shifted: dict[str, float] | None = None,
-    wavelengths: tuple[float, ...] = (),
-    count: int = 400,
-    failed: tuple[int, ...] = (),
-    readings: dict[str, float] | None = None,
-    seed: int = 0,
-    **provenance: object,
-) -> xr.DataTree:
+    names=NAMES,
+    narrow=None,
+    shifted=None,
+    wavelengths=(),
+    count=400,
+    failed=(),
+    readings=None,
+    seed=0,
+    **provenance,
+):
     """Truths, readings and their posteriors, all normal.
 
     `narrow` multiplies the posterior sd of a parameter, `shifted` moves its mean by so many; all
@@ -75,9 +75,7 @@ def make_calibration(
     return tree
 
 
-def _readings(
-    spread: dict[str, float], count: int, failed: tuple[int, ...], random: np.random.Generator
-) -> dict:
+def _readings(spread, count, failed, random):
     found: dict = {"predictive_pit": {}, "loo_pit": {}, "readings": {}}
     for name in ("dop", "intensity"):
         for group in ("predictive_pit", "loo_pit"):

@@ -18,15 +18,15 @@ def flags(names: type[Status] | type[MethodUsed], values: np.ndarray) -> tuple:
 
 
 def make_maps(
-    means: dict[str, np.ndarray],
+    means,
     *,
-    width: float = 1.0,
-    status: np.ndarray | None = None,
-    methods: np.ndarray | None = None,
-    wavelengths: tuple[float, ...] = (),
-    method: str = "corrected-laplace",
-    **provenance: object,
-) -> xr.Dataset:
+    width=1.0,
+    status=None,
+    methods=None,
+    wavelengths=(),
+    method="corrected-laplace",
+    **provenance,
+):
     """Uniform posteriors of that width about the means, (y, x) or (y, x, wavelength)."""
     shape = next(iter(means.values())).shape[:2]
     status = np.full(shape, Status.GOOD) if status is None else status

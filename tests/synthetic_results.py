@@ -213,11 +213,7 @@ def _predict(design, offset, theta, observed, valid, grid, lead, rng):
         centers[variable] = (dims, center.reshape(shape))
         predictive[variable] = (dims, predicted.reshape(shape))
         density[variable] = (dims, np.where(valid, log_density, 0.0).reshape(shape))
-    return {
-        "noise_free": centers,
-        "posterior_predictive": predictive,
-        "log_likelihood": density,
-    }
+    return {"noise_free": centers, "posterior_predictive": predictive, "log_likelihood": density}
 
 
 def _posterior(design, offset, observed, used, location, width):

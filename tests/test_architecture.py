@@ -1,6 +1,7 @@
 """The layers of the package: every import points up the list, and packages stay in their homes."""
 
 import ast
+import functools
 import re
 import tomllib
 from collections.abc import Iterator
@@ -85,24 +86,27 @@ def modules() -> Iterator[tuple[str, Path]]:
             yield ".".join((prefix, *(part for part in parts if part != "__init__"))), path
 
 
-def imports(path: Path) -> Iterator[tuple[str, bool]]:
+def statements(node: ast.AST, inside: bool = False) -> Iterator[tuple[ast.AST, bool]]:
+    """Every node below, and whether it stands in a function."""
+    for child in ast.iter_child_nodes(node):
+        within = inside or isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef)
+        yield child, within
+        yield from statements(child, within)
+
+
+@functools.cache
+def imports(path: Path) -> tuple[tuple[str, bool], ...]:
     """Every module that a file imports, and whether it does so inside a function."""
-    tree = ast.parse(path.read_text())
-    inside = {
-        id(node)
-        for function in ast.walk(tree)
-        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
-        for node in ast.walk(function)
-    }
-    for node in ast.walk(tree):
+    found = []
+    for node, inside in statements(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            for alias in node.names:
-                yield alias.name, id(node) in inside
+            found += [(alias.name, inside) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
             module = node.module or ""
-            for name in [alias.name for alias in node.names] if module == "polar_bayes" else [""]:
-                yield f"{module}.{name}".rstrip("."), id(node) in inside
+            names = [alias.name for alias in node.names] if module == "polar_bayes" else [""]
+            found += [(f"{module}.{name}".rstrip("."), inside) for name in names]
+    return tuple(found)
 
 
 def belongs(module: str, layer: str) -> bool:

@@ -1,8 +1,9 @@
 """What a reader may paste works: Python runs, commands parse, names, links and messages exist.
 
-The first fit is done in full, by the method that compiles fastest, and so is every fit that states
-its own small settings. The others are checked as far as the trace of their posterior density and
-give back the latest result: each would compile programs of its own.
+The first fit is done by the method that compiles fastest (in the thorough tests of its own scene,
+else of a plate), and so is every fit that states its own small settings. The others are checked as
+far as the trace of their posterior density and give back the latest result: each would compile
+programs of its own.
 """
 
 import ast
@@ -40,9 +41,8 @@ PAGES = [README, ROOT / "CONTRIBUTING.md", *DOCS]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 CODE = re.compile(r"`([^`\n]+)`")
 RUN = ("README.md", "quickstart.md")
-TINY = pb.methods.Laplace(
-    chains=2, draws=50
-)  # the sampler itself runs where a page states settings
+TINY = pb.methods.Laplace(chains=2, draws=50)  # the sampler runs where a page states settings
+PLATE = pb.Scene(pb.SmoothSurface(), pb.Unpolarized(), pb.StokesMixing())
 CHANGED = (
     "jax_enable_x64",
     "jax_compilation_cache_dir",
@@ -73,9 +73,10 @@ def inline(page: Path) -> list[str]:
 
 
 class Fits:
-    """Stands in for `polar_bayes.fit` on the pages."""
+    """Stands in for `polar_bayes.fit` on the pages; `instead` replaces what its first fit asks."""
 
-    def __init__(self) -> None:
+    def __init__(self, **instead: object) -> None:
+        self.instead = {"method": TINY, **instead}
         self.latest: xr.DataTree | None = None
 
     def __call__(self, capture: xr.Dataset, **asked: object) -> xr.DataTree:
@@ -84,7 +85,7 @@ class Fits:
             return self.latest
         rehearse(capture, asked)
         if self.latest is None:
-            self.latest = fit(capture, **asked | {"method": TINY})
+            self.latest = fit(capture, **asked | self.instead)
         return self.latest
 
 
@@ -102,9 +103,7 @@ def rehearse(capture: xr.Dataset, asked: dict[str, object]) -> None:
 quickly = contextlib.contextmanager(compiled_fast)
 
 
-@pytest.fixture(scope="module")
-def fits() -> Fits:
-    return Fits()
+IN_FULL, OF_A_PLATE = Fits(), Fits(scene=PLATE, links={"dop": pb.links.NormalLink()})
 
 
 @pytest.fixture
@@ -118,17 +117,17 @@ def settings_of_jax() -> Iterator[None]:
 
 @pytest.mark.usefixtures("settings_of_jax")
 @pytest.mark.parametrize(
-    "page",
+    ("page", "fits"),
     [
-        page if page.name in RUN else pytest.param(page, marks=pytest.mark.thorough)
-        for page in PAGES
-        if any(blocks(page, "python"))
+        *(pytest.param(page, OF_A_PLATE, id=page.name) for page in PAGES if page.name in RUN),
+        *(
+            pytest.param(page, IN_FULL, id=f"{page.name} in full", marks=pytest.mark.thorough)
+            for page in PAGES
+            if any(blocks(page, "python"))
+        ),
     ],
-    ids=lambda page: page.name,
 )
-def test_the_python_of_a_page_runs(
-    page: Path, fits: Fits, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_python_of_a_page_runs(page, fits, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(pb, "fit", fits)
     namespace: dict[str, object] = {"__name__": page.stem}

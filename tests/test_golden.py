@@ -38,18 +38,21 @@ def capture(views: int = 16, wavelengths: tuple[float, ...] = (), seed: int = 3)
     return pb.simulate("leaf", seed=seed, protocol=protocol)
 
 
+def several(dim: str, count: int, views: int):
+    """Captures of the first seeds, side by side."""
+    kept = {"data_vars": "all", "coords": "minimal", "compat": "override", "join": "override"}
+    return xr.concat([capture(views, seed=seed) for seed in range(count)], dim, **kept)
+
+
+def materials():
+    return several("material", 3, 10).assign_coords(material=["a", "b", "c"])
+
+
 def image():
-    one = capture(12)
-    rows = [
-        pb.simulate("leaf", seed=s, protocol=pb.simulation.Protocol(views=12, wavelengths=()))
-        for s in range(6)
-    ]
-    whole = xr.concat(
-        rows, "pixel", data_vars="all", coords="minimal", compat="override", join="override"
-    )
     index = {"y": ("pixel", [0, 0, 0, 1, 1, 1]), "x": ("pixel", [0, 1, 2, 0, 1, 2])}
-    found = whole.assign_coords(index).set_index(pixel=("y", "x")).unstack("pixel")
-    return found.transpose("y", "x", ...).assign_attrs(one.attrs)
+    whole = several("pixel", 6, 12).assign_coords(index)
+    found = whole.set_index(pixel=("y", "x")).unstack("pixel")
+    return found.transpose("y", "x", ...).assign_attrs(capture(12).attrs)
 
 
 def numbers_of(result) -> dict[str, tuple[float, float]]:
@@ -64,48 +67,19 @@ def numbers_of(result) -> dict[str, tuple[float, float]]:
     return found
 
 
-def of_fit(**settings):
-    def run():
-        return numbers_of(pb.fit(capture(), seed=1, **settings))
-
-    return run
-
-
-def of_groups(model, wavelengths, material=False, **settings):
-    def run():
-        if material:
-            several = [capture(10, seed=s) for s in range(3)]
-            one = xr.concat(
-                several,
-                "material",
-                data_vars="all",
-                coords="minimal",
-                compat="override",
-                join="override",
-            )
-            one = one.assign_coords(material=["a", "b", "c"])
-        else:
-            one = capture(10, wavelengths)
-        return numbers_of(pb.fit(one, model=model, seed=1, **settings))
-
-    return run
+def of_fit(make: Callable = capture, **settings):
+    return lambda: numbers_of(pb.fit(make(), seed=1, **settings))
 
 
 def map_of(**settings):
     def run():
-        maps = pb.fit_pixels(image(), seed=1, **settings)
-        names = ("roughness", "subsurface_fraction", "absorption", "refractive_index")
-        draws = 256.0
-        found = {}
-        for name in names:
-            mean = np.asarray(maps[f"{name}_mean"] if f"{name}_mean" in maps else maps[name])
-            sd = np.asarray(maps[f"{name}_sd"])
-            for at, value in enumerate(mean.ravel()[:3]):
-                found[f"{name} mean {at}"] = (float(value), float(sd.ravel()[at]) / draws**0.5)
-                found[f"{name} sd {at}"] = (
-                    float(sd.ravel()[at]),
-                    float(sd.ravel()[at]) / draws**0.5,
-                )
+        maps, found = pb.fit_pixels(image(), seed=1, **settings), {}
+        for name in ("roughness", "subsurface_fraction", "absorption", "refractive_index"):
+            means, sds = (np.asarray(maps[each]).ravel() for each in (name, f"{name}_sd"))
+            for at, (mean, sd) in enumerate(zip(means[:3], sds, strict=False)):
+                error = float(sd) / 256.0**0.5  # of so many draws
+                found[f"{name} mean {at}"] = (float(mean), error)
+                found[f"{name} sd {at}"] = (float(sd), error)
         return found
 
     return run
@@ -141,18 +115,10 @@ def views():
 
 
 def effects():
-    chosen = pb.choose_effects(capture(10, (450.0, 650.0)), seed=1)
-    numbers = {}
-    for name in ("change", "shift", "information", "readings"):
-        if name in chosen.ledger:
-            for at, x in enumerate(np.asarray(chosen.ledger[name], float).ravel()):
-                if np.isfinite(x):
-                    numbers[f"{name} {at}"] = (float(x), 0.0)
-    kept = chosen.ledger["kept"] if "kept" in chosen.ledger else None
-    if kept is not None:
-        for at, x in enumerate(np.asarray(kept).ravel()):
-            numbers[f"kept {at}"] = (float(bool(x)), 0.0)
-    return numbers
+    ledger = pb.choose_effects(capture(10, (450.0, 650.0)), seed=1).ledger
+    kept = np.asarray(ledger["kept"]).ravel()
+    numbers = finite_numbers(ledger[["change", "shift"]])
+    return numbers | {f"kept {at}": (float(x), 0.0) for at, x in enumerate(kept)}
 
 
 QUICK_NUTS = pb.methods.Nuts(warmup=200, draws=500, most_draws=500, chains=2)
@@ -162,8 +128,10 @@ CASES: dict[str, Callable] = {
     "nuts": of_fit(method=QUICK_NUTS),
     "importance": of_fit(method=pb.methods.Importance()),
     "auto": of_fit(method="auto"),
-    "hierarchical": of_groups("hierarchical", (), material=True, method=QUICK_NUTS),
-    "gp_spectral": of_groups("gp_spectral", (450.0, 550.0, 650.0), method=QUICK_NUTS),
+    "hierarchical": of_fit(materials, model="hierarchical", method=QUICK_NUTS),
+    "gp_spectral": of_fit(
+        lambda: capture(10, (450.0, 550.0, 650.0)), model="gp_spectral", method=QUICK_NUTS
+    ),
     "map laplace": map_of(),
     "map importance": map_of(method="importance"),
     "calibration": calibration,

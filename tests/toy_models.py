@@ -1,11 +1,16 @@
 """Models whose posteriors are known: they compile in a second, and no method may get them wrong."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
 import xarray as xr
 from numpyro import distributions as dist
 from plates import plate_capture
+
+import polar_bayes as pb
+from polar_bayes.inference.problem import Problem, make_problem
+from polar_bayes.inference.request import Request, resolve
 
 NOISE = 0.5
 VIEWS = np.linspace(35.0, 75.0, 6)
@@ -14,6 +19,18 @@ VIEWS = np.linspace(35.0, 75.0, 6)
 def capture(seed: int = 0) -> xr.Dataset:
     """Six readings of q."""
     return plate_capture(VIEWS, 0.05, seed)
+
+
+def request_of(model, precision: str = "double") -> Request:
+    """What is asked of these readings by a model."""
+    links = {"q": pb.links.StokesLink()}
+    return resolve(capture(), model, "paper", None, links, 90.0, 0, precision)
+
+
+def problem(model, seed: int = 0, precision: str = "double") -> Problem:
+    """A model of these readings, compiled."""
+    key = jax.random.split(jax.random.key(seed))[0]
+    return make_problem(request_of(model, precision), key)
 
 
 def line(data, scene, priors, links) -> None:

@@ -5,7 +5,6 @@ along them have Stokes components q > 0 (along s) and u > 0 (half-way between th
 """
 
 import itertools
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -48,12 +47,7 @@ def facet_of(view: tuple[float, float], light: tuple[float, float]) -> tuple[flo
     return length**2, across / length if length > 1e-14 else axes(*light)[0]
 
 
-def mirrored(
-    powers: Powers,
-    view: tuple[float, float],
-    light: tuple[float, float],
-    incident: tuple[float, float] = (0.0, 0.0),
-) -> np.ndarray:
+def mirrored(powers, view, light, incident=(0.0, 0.0)):
     """Stokes vector that a facet sends to the viewer, per unit power that falls on it."""
     s, p, cross = powers
     _, axis = facet_of(view, light)
@@ -75,12 +69,7 @@ def admittances(index: complex, sin_squared: float) -> np.ndarray:
     return np.array([index * inside, index / inside])
 
 
-def films(
-    above: float,
-    layers: Sequence[tuple[float, float]],
-    below: float,
-    sin_squared: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def films(above, layers, below, sin_squared):
     """Fields reflected and passed, and power passed, for s and p, by characteristic matrices.
 
     `layers` are (index, 2 pi thickness/wavelength) from the top down; none for a bare boundary.
@@ -110,9 +99,7 @@ def bare(index: float, sin_squared: float) -> Powers:
     return powers(films(1.0, (), index, sin_squared)[0])
 
 
-def bounced(
-    indexes: Sequence[float], absorbances: Sequence[float], sin_squared: float, bounces: int = 4000
-) -> tuple[np.ndarray, np.ndarray]:
+def bounced(indexes, absorbances, sin_squared, bounces=4000):
     """Reflectance and transmittance (s, p, cross) of thick layers, by following every bounce.
 
     `indexes` run from air to body, `absorbances` over the layers between.
@@ -229,9 +216,7 @@ class Population:
         first, other = axis @ s, axis @ second
         return shown, light, r_s, r_p, first**2 - other**2, 2.0 * first * other
 
-    def sky(
-        self, zenith: float, azimuth: float, index: float, *, correlated: bool = False
-    ) -> np.ndarray:
+    def sky(self, zenith, azimuth, index, *, correlated=False):
         """Stokes vector under a sky of unit radiance."""
         shown, light, r_s, r_p, cos, sin = self._seen(zenith, azimuth, index)
         above = light[:, 2] > 0.0

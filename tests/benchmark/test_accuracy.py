@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from collections.abc import Iterator
 from typing import override
 
 import jax
@@ -10,15 +9,13 @@ import numpy as np
 import pytest
 import xarray as xr
 from cases import each
-from toy_models import capture, line, of_line, squared
+from toy_models import capture, line, of_line, problem, request_of, squared
 
 import polar_bayes as pb
 from polar_bayes.benchmark import run
 from polar_bayes.benchmark.advice import AS_GIVEN
 from polar_bayes.benchmark.reference import ReferenceRun, best_reference, run_reference
 from polar_bayes.benchmark.run import AbstractOverride, Trial, run_in_subprocess
-from polar_bayes.inference.problem import make_problem
-from polar_bayes.inference.request import resolve
 from polar_bayes.methods.method import AbstractMethod, PosteriorDraws
 from polar_bayes.numerics.mcse import standard_errors
 from polar_bayes.numerics.psis import systematic_resample
@@ -28,11 +25,7 @@ LINKS = {"q": pb.links.StokesLink()}
 ROUGHLY = pb.benchmark.Reference(error=0.05, longer=0)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def compile_fast_rather_than_fast_code() -> Iterator[None]:
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,7 +148,7 @@ def test_a_choice_of_effects_that_failed_is_not_tried_again(monkeypatch):
         raise pb.FitError("no peak", where="choose_effects", hint="nothing")
 
     monkeypatch.setattr(run, "choose_effects", refuse)
-    request = resolve(capture(), line, "paper", None, LINKS, 90.0, 0, "double")
+    request = request_of(line)
     for method in (pb.methods.Laplace(), pb.methods.Nuts()):
         with pytest.raises(pb.FitError, match="no peak"):
             pb.benchmark.EffectsOverride().apply(request, method)
@@ -185,7 +178,7 @@ def test_without_processes_of_their_own_first_times_and_memory_are_not_told(stud
 
 @pytest.mark.thorough
 def test_facets_are_turned_where_there_are_any():
-    request = resolve(capture(), line, "paper", None, LINKS, 90.0, 0, "double")
+    request = request_of(line)
     changed, method = pb.benchmark.FacetsOverride(0.5).apply(request, pb.methods.Nuts())
     before, after = (
         [part for _, part in parts_of(scene) if isinstance(part, pb.physics.FacetQuadrature)]
@@ -203,7 +196,7 @@ def test_facets_are_turned_where_there_are_any():
 
 
 def test_an_override_of_draws_turns_what_its_name_says_or_nothing():
-    request = resolve(capture(), line, "paper", None, LINKS, 90.0, 0, "double")
+    request = request_of(line)
     quarter = pb.benchmark.DrawsOverride(0.25)
     for name, method in pb.methods.STUDY_METHODS.items():
         changed = quarter.apply(request, method)
@@ -226,8 +219,7 @@ def test_every_override_has_a_name_of_its_own():
 
 @pytest.mark.thorough
 def test_where_chains_miss_a_mode_weighted_draws_are_the_reference():
-    request = resolve(capture(), squared, "paper", None, LINKS, 90.0, 0, "double")
-    reference = run_reference(ROUGHLY, make_problem(request, jax.random.key(0)), jax.random.key(1))
+    reference = run_reference(ROUGHLY, problem(squared), jax.random.key(1))
     assert reference.method == "weighted draws"
     assert not reference.doubts
     # Its own error is that of the weights, too.
@@ -302,7 +294,7 @@ def test_a_process_of_its_own_finds_no_compiled_programs(monkeypatch):
 
 @pytest.mark.thorough
 def test_a_trial_runs_in_a_process_of_its_own():
-    request = resolve(capture(), line, "paper", None, LINKS, 90.0, 0, "double")
+    request = request_of(line)
     found = run_in_subprocess(Trial(request, pb.methods.Laplace(draws=50)))
     assert found.labels == ("level", "slope")
     assert found.draws.shape == (2, 4, 50)

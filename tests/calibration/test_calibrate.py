@@ -1,4 +1,4 @@
-"""Calibration of plates, whose fits take no time: right methods pass, broken ones are caught."""
+"""Calibration of lines and plates, whose fits take no time: right methods pass, broken do not."""
 
 import re
 import sys
@@ -10,12 +10,12 @@ import xarray as xr
 from cases import each
 from numpyro import handlers
 from plates import LINKS, PLATE, plate_capture
+from toy_models import line
 
 import polar_bayes as pb
 from polar_bayes import progress
 from polar_bayes.calibration.calibrate import Forecast, make_plan
 from polar_bayes.calibration.runner import fit_block
-from polar_bayes.inference.batching import Status
 from polar_bayes.inference.request import resolve
 from polar_bayes.models.per_material import per_material
 
@@ -25,6 +25,9 @@ ASKED = {
     "links": LINKS,
     "method": "importance",
 }
+OF_LINES = {"model": line, "scene": PLATE, "links": LINKS, "method": "laplace"}
+"""A model that compiles in a moment, whose posterior is normal."""
+
 COUNT = 600
 
 
@@ -35,7 +38,7 @@ def capture() -> xr.Dataset:
 
 @pytest.fixture(scope="module")
 def corrected(capture: xr.Dataset) -> xr.DataTree:
-    return pb.calibrate(capture, simulations=COUNT, **ASKED)
+    return pb.calibrate(capture, simulations=COUNT, **OF_LINES)
 
 
 def test_what_is_right_passes(corrected: xr.DataTree) -> None:
@@ -43,8 +46,8 @@ def test_what_is_right_passes(corrected: xr.DataTree) -> None:
 
 
 @pytest.mark.thorough
-@each("method", ["corrected-laplace", "nuts"])
-def test_other_right_methods_pass(method: str, capture: xr.Dataset) -> None:
+@each("method", ["importance", "corrected-laplace", "nuts"])
+def test_every_right_method_passes(method: str, capture: xr.Dataset) -> None:
     assert_passes(pb.calibrate(capture, simulations=COUNT, **ASKED | {"method": method}))
 
 
@@ -92,7 +95,7 @@ def test_the_tree_holds_every_fit(corrected: xr.DataTree) -> None:
     assert dict(corrected["prior_sbc"].sizes) == {"simulation": COUNT}
     fits = corrected["fits"].to_dataset()
     assert set(fits.data_vars) >= {"status", "method", "pareto_k", "ess", "steps"}
-    pit = corrected["prior_sbc"]["refractive_index"]
+    pit = corrected["prior_sbc"]["slope"]
     assert float(pit.min()) > 0.0
     assert float(pit.max()) < 1.0
 
@@ -119,7 +122,7 @@ def test_readings_see_a_wrong_noise(capture: xr.Dataset) -> None:
 
 @pytest.mark.thorough
 def test_what_is_off_leaves_no_trace(capture: xr.Dataset, corrected: xr.DataTree) -> None:
-    bare = pb.calibrate(capture, simulations=64, readings=False, **ASKED)
+    bare = pb.calibrate(capture, simulations=64, readings=False, **OF_LINES)
     assert set(bare.children) == {"prior_sbc", "truth", "marginals", "fits"}
     assert not any("eadings" in line for line in pb.verdict(bare).sentences)
     for name in bare.children:
@@ -129,24 +132,13 @@ def test_what_is_off_leaves_no_trace(capture: xr.Dataset, corrected: xr.DataTree
 
 @pytest.mark.thorough
 def test_a_simulation_does_not_depend_on_how_many_there_are(capture, corrected) -> None:
-    few = pb.calibrate(capture, simulations=150, **ASKED)
+    few = pb.calibrate(capture, simulations=150, **OF_LINES)
     some = corrected["truth"].to_dataset().isel(simulation=slice(150))
     xr.testing.assert_identical(few["truth"].to_dataset(), some)
     xr.testing.assert_identical(
         few["marginals"].to_dataset(),
         corrected["marginals"].to_dataset().isel(simulation=slice(150)),
     )
-
-
-@pytest.mark.thorough
-def test_fits_that_are_not_trusted_are_counted_and_ranked(capture: xr.Dataset) -> None:
-    method = pb.methods.Nuts(chains=2, warmup=50, draws=50, most_draws=50)
-    calibration = pb.calibrate(capture, simulations=40, **ASKED | {"method": method})
-    table = pb.summary(calibration)
-    doubted = int(np.sum(calibration["fits"]["status"] == Status.NOT_TRUSTED))
-    assert doubted > 0
-    assert (table["answered"] == 40).all()
-    assert f"{doubted} of 40 fits: not trusted." in pb.verdict(calibration).sentences
 
 
 def test_mistakes_are_told(capture: xr.Dataset) -> None:
@@ -163,10 +155,10 @@ def test_mistakes_are_told(capture: xr.Dataset) -> None:
 
 
 def test_a_long_calibration_says_how_long_and_what_a_faster_method_makes_of_it(
-    capture: xr.Dataset, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    capture, capsys, monkeypatch
+):
     monkeypatch.setattr(progress, "_write_line", [lambda text: sys.stderr.write(f"{text}\n")])
-    asked = ASKED["model"], ASKED["scene"], None, ASKED["links"], 90.0, 0, "double"
+    asked = OF_LINES["model"], PLATE, None, LINKS, 90.0, 0, "double"
     plan = make_plan(resolve(capture, *asked), None, pb.methods.Laplace(), False)
     blocks = [fit_block(plan, np.arange(4) + begin) for begin in (0, 4, 8)]
     brief, long = Forecast(plan, long=1e9), Forecast(plan, long=0.0)

@@ -1,12 +1,7 @@
 """Calibrations side by side, and in which way each strays."""
 
-from pathlib import Path
-
-import numpy as np
 import pytest
-import xarray as xr
 from synthetic_calibrations import make_calibration
-from synthetic_results import make_result
 
 import polar_bayes as pb
 
@@ -75,21 +70,3 @@ def test_what_cannot_be_compared_is_refused() -> None:
     few = make_calibration(names=("roughness",))
     with pytest.raises(pb.FitError, match="b: it has other parameters than a; calibrate the same"):
         pb.calibration.compare_calibrations({"a": make_calibration(), "b": few})
-
-
-def test_calibrations_come_back_from_files(tmp_path: Path) -> None:
-    tree, fit = make_calibration(failed=(1,)), make_result(views=4, draws=20, wavelengths=())
-    pb.save(tree, tmp_path / "sbc.nc")
-    pb.save(fit, tmp_path / "fit.nc")
-    (tmp_path / "text.nc").write_text("nothing")
-    read = pb.load(tmp_path / "sbc.nc")
-    xr.testing.assert_identical(read["prior_sbc"].to_dataset(), tree["prior_sbc"].to_dataset())
-    assert np.isnan(read["prior_sbc"]["roughness"].to_numpy()[1])
-    for name, what in {
-        "fit": "it holds no calibration",
-        "text": "cannot be read as netCDF",
-    }.items():
-        with pytest.raises(pb.FitError, match=f"{what}; give the file that polar_bayes.save"):
-            pb.load(tmp_path / f"{name}.nc", "calibration")
-    with pytest.raises(pb.CaptureError, match="there is no such file"):
-        pb.load(tmp_path / "nowhere.nc")

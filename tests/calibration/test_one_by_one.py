@@ -1,7 +1,7 @@
 """Calibration by the fits of `polar_bayes.fit`, of models with more axes than a pixel has."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, override
 
 import jax
@@ -28,26 +28,21 @@ COUNT, PATCHES, VIEWS, NOISE = 80, 3, 4, 0.5
 SHORT = pb.methods.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
 
 
-def population(data, scene, priors, links) -> None:
+def population_of(noise: float) -> Callable:
     """Normal means of normal patches: its posterior is normal, so `Laplace` is exact."""
-    del scene, priors, links
-    location = numpyro.sample("location", dist.Normal(0.0, 2.0))
-    with numpyro.plate("patch", data.shape[0], dim=-2):
-        level = numpyro.sample("level", dist.Normal(location, 1.0))
-        with numpyro.plate("view", data.shape[1], dim=-1):
-            numpyro.sample("q", dist.Normal(level, NOISE), obs=data.readings["q"])
+
+    def population(data, scene, priors, links) -> None:
+        del scene, priors, links
+        location = numpyro.sample("location", dist.Normal(0.0, 2.0))
+        with numpyro.plate("patch", data.shape[0], dim=-2):
+            level = numpyro.sample("level", dist.Normal(location, 1.0))
+            with numpyro.plate("view", data.shape[1], dim=-1):
+                numpyro.sample("q", dist.Normal(level, noise), obs=data.readings["q"])
+
+    return population
 
 
-def too_sure(data, scene, priors, links) -> None:
-    """The same with half the noise."""
-    del scene, priors, links
-    location = numpyro.sample("location", dist.Normal(0.0, 2.0))
-    with numpyro.plate("patch", data.shape[0], dim=-2):
-        level = numpyro.sample("level", dist.Normal(location, 1.0))
-        with numpyro.plate("view", data.shape[1], dim=-1):
-            numpyro.sample("q", dist.Normal(level, NOISE / 2.0), obs=data.readings["q"])
-
-
+population, too_sure = population_of(NOISE), population_of(NOISE / 2.0)
 ASKED: dict[str, Any] = {"scene": PLATE, "links": LINKS, "readings": False}
 
 
@@ -97,9 +92,7 @@ def test_a_model_that_is_too_sure_is_caught(capture: xr.Dataset) -> None:
 
 
 @pytest.mark.thorough
-def test_a_fit_does_not_depend_on_how_many_there_are(
-    capture: xr.Dataset, exact: xr.DataTree
-) -> None:
+def test_a_fit_does_not_depend_on_how_many_there_are(capture, exact):
     laplace = pb.methods.Laplace(draws=200, chains=1)
     few = pb.calibrate(capture, simulations=22, model=population, method=laplace, **ASKED)
     for group in ("truth", "prior_sbc", "marginals"):
@@ -121,9 +114,7 @@ def test_chains_that_are_too_short_are_ranked_and_not_trusted(capture: xr.Datase
 
 
 @pytest.mark.thorough
-def test_fits_without_draws_are_counted(
-    capture: xr.Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fits_without_draws_are_counted(capture, monkeypatch):
     """Whatever a fit raises for want of a peak: it is not left out, and has no rank."""
     inner = problem.CompiledModel.initializer.func
     refused = []
@@ -160,15 +151,17 @@ def test_weighted_draws_of_a_discrepancy_are_made_one_after_another_in_double_pr
     assert np.mean(found["fits"]["status"] == Status.GOOD) > 0.5
 
 
-def test_a_fit_is_that_of_the_public_verb(capture: xr.Dataset) -> None:
-    """The same posterior: mean and spread against the closed form."""
+def problem_of(capture: xr.Dataset) -> Problem:
     request = resolve(capture, population, PLATE, None, LINKS, None, 0, "double")
     data = observe(request.capture)
-    compiled_model = compile_model(request, data)
-    settings = pb.methods.Laplace(draws=4000, chains=1)
-    here = problem.Problem(compiled_model, data, jax.random.key(1))
+    return Problem(compile_model(request, data), data, jax.random.key(1))
+
+
+def test_a_fit_is_that_of_the_public_verb(capture: xr.Dataset) -> None:
+    """The same posterior: mean and spread against the closed form."""
+    settings, here = pb.methods.Laplace(draws=4000, chains=1), problem_of(capture)
     parameters = here.constrain(settings.run(here, jax.random.key(2), no_progress).z)
-    q = np.asarray(data.readings["q"])
+    q = np.asarray(here.data.readings["q"])
     # Patch means are normal around the location with the variance of a patch and of its mean.
     spread = 1.0 + NOISE**2 / VIEWS
     precision = 0.25 + PATCHES / spread
@@ -180,14 +173,12 @@ def test_a_fit_is_that_of_the_public_verb(capture: xr.Dataset) -> None:
 
 @pytest.mark.thorough
 def test_chains_of_any_length_have_their_parameters(capture: xr.Dataset) -> None:
-    request = resolve(capture, population, PLATE, None, LINKS, None, 0, "double")
-    data = observe(request.capture)
-    here = problem.Problem(compile_model(request, data), data, jax.random.key(1))
+    here = problem_of(capture)
     program = here.program
     z = np.random.default_rng(1).normal(size=(2, BLOCK + 3, program.size))
     found = here.constrain(z)
     assert found["level"].shape[:2] == z.shape[:2]
-    last = program.parameters(z[1, -1], data)["level"]
+    last = program.parameters(z[1, -1], here.data)["level"]
     np.testing.assert_array_equal(found["level"][1, -1], last)
 
 

@@ -80,11 +80,7 @@ def test_attributes_that_all_share_are_kept(pair):
     pair["plexiglas"].attrs |= {"setup": "goniometer", "operator": "Bob"}
     del pair["plexiglas"].attrs["shots"]
     attributes = combine(pair).attrs
-    assert attributes == {
-        "name": "glass, plexiglas",
-        "setup": "goniometer",
-        "lamp_current": 1.5,
-    }
+    assert attributes == {"name": "glass, plexiglas", "setup": "goniometer", "lamp_current": 1.5}
 
 
 @pytest.mark.thorough

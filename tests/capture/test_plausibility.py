@@ -6,6 +6,7 @@ import xarray as xr
 from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plates import at_mirror
 
 import polar_bayes as pb
 from polar_bayes.capture.plausibility import (
@@ -30,12 +31,8 @@ def plate(zeniths=ZENITHS, index=1.5, **variables) -> xr.Dataset:
     """A polished plate at the mirror angle, without noise."""
     s, p = fresnel(np.asarray(zeniths), index)
     q = (s - p) / (s + p)
-    columns = {
-        "view_zenith": zeniths, "view_azimuth": np.full(len(q), 180.0),
-        "light_zenith": zeniths, "light_azimuth": np.zeros(len(q)),
-        "dop": np.abs(q), "q": q, "q_error": np.full(len(q), 0.01),
-    }  # fmt: skip
-    return xr.Dataset({name: ("view", np.asarray(x)) for name, x in (columns | variables).items()})
+    readings = {"dop": np.abs(q), "q": q, "q_error": np.full(len(q), 0.01)}
+    return at_mirror(zeniths, **readings | variables)
 
 
 def without(capture, *names) -> xr.Dataset:

@@ -82,21 +82,34 @@ def test_a_draw_has_one_finite_reading_per_view(name, link):
     draws = draw(name, link)
     assert draws.shape == (400, *SHAPE)
     assert np.all(np.isfinite(draws))
-    assert np.all(distribution.support(draws))
+    assert np.all(jax.jit(lambda x: distribution.support(x))(draws))
+
+
+def density_of(name, link, dtype):
+    """The log density as a function, and its arguments: prediction, noise, views, reading."""
+
+    def density(prediction, noise, data, reading):
+        return link.distribution(name, prediction, data, noise).log_prob(reading)
+
+    reading = draw(name, link)[0].astype(dtype)
+    return density, (make_prediction(dtype), make_noise(link, dtype), make_data(dtype), reading)
+
+
+def slopes_of(density):
+    """Compiled: density in every view, and the slopes of their sum by prediction and noise."""
+
+    def total(*arguments):
+        found = density(*arguments)
+        return found.sum(), found
+
+    return jax.jit(jax.value_and_grad(total, argnums=(0, 1), has_aux=True))
 
 
 @EVERY_LINK
 @each("dtype", [np.float64, np.float32])
-def test_density_and_gradient_are_finite_and_compiling_changes_nothing(name, link, dtype):
-    data, reading = make_data(dtype), draw(name, link)[0].astype(dtype)
-
-    def total(prediction, noise):
-        density = link.distribution(name, prediction, data, noise).log_prob(reading)
-        return density.sum(), density
-
-    arguments = (make_prediction(dtype), make_noise(link, dtype))
-    compiled = jax.jit(jax.value_and_grad(total, argnums=(0, 1), has_aux=True))
-    (_, density), (by_prediction, by_noise) = compiled(*arguments)
+def test_density_and_gradient_are_finite(name, link, dtype):
+    density, arguments = density_of(name, link, dtype)
+    (_, density), (by_prediction, by_noise) = slopes_of(density)(*arguments)
     assert density.shape == SHAPE
     assert density.dtype == dtype
     assert np.all(np.isfinite(density))
@@ -104,9 +117,16 @@ def test_density_and_gradient_are_finite_and_compiling_changes_nothing(name, lin
     assert np.any(by_prediction[name] != 0.0)
     # Every parameter that a link names matters, and it names every one that it reads.
     assert all(np.isfinite(slope) and slope != 0.0 for slope in by_noise.values())
-    if dtype == np.float64:  # which steps are compiled does not depend on the precision
-        # Compiled arithmetic may be fused: some units in the last place, of sums up to about ten.
-        np.testing.assert_allclose(total(*arguments)[1], density, rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.thorough
+@EVERY_LINK
+def test_compiling_changes_nothing(name, link):
+    density, arguments = density_of(name, link, np.float64)
+    # Compiled arithmetic may be fused: some units in the last place, of sums up to about ten.
+    np.testing.assert_allclose(
+        density(*arguments), jax.jit(density)(*arguments), rtol=1e-13, atol=1e-13
+    )
 
 
 @pytest.mark.thorough
@@ -140,13 +160,10 @@ def test_a_link_is_a_constant_of_a_compiled_program(name, link):
 @pytest.mark.thorough
 @EVERY_LINK
 def test_brightness_and_angle_of_one_view_do_not_reach_another(name, link):
-    prediction, noise, reading = make_prediction(), make_noise(link), draw(name, link)[0]
-    data = make_data()
+    density, (prediction, noise, data, reading) = density_of(name, link, np.float64)
     changed = dataclasses.replace(data, brightness=data.brightness.at[1, 2].set(0.01))
-    plain, other = (
-        link.distribution(name, prediction, views, noise).log_prob(reading)
-        for views in (data, changed)
-    )
+    compiled = jax.jit(density)
+    plain, other = (compiled(prediction, noise, views, reading) for views in (data, changed))
     rest = np.ones(SHAPE, bool)
     rest[1, 2] = False
     np.testing.assert_array_equal(np.asarray(plain)[rest], np.asarray(other)[rest])
@@ -163,10 +180,10 @@ def trusting(data, confidence):
 
 @EVERY_LINK
 def test_full_trust_is_as_if_nothing_were_said(name, link):
-    prediction, noise, reading = make_prediction(), make_noise(link), draw(name, link)[0]
+    density, (prediction, noise, data, reading) = density_of(name, link, np.float64)
     plain, sure = (
-        link.distribution(name, prediction, data, noise).log_prob(reading)
-        for data in (make_data(), trusting(make_data(), jnp.ones((1, 4))))
+        jax.jit(density)(prediction, noise, views, reading)
+        for views in (data, trusting(data, jnp.ones((1, 4))))
     )
     np.testing.assert_array_equal(sure, plain)
 
@@ -194,17 +211,11 @@ def test_trust_of_one_view_is_its_precision(name, link):
 @EVERY_LINK
 @each("dtype", [np.float64, np.float32])
 def test_density_and_slopes_stay_finite_down_to_no_trust_at_all(name, link, dtype):
-    data = trusting(make_data(dtype), TRUST.astype(dtype))
-    reading = draw(name, link)[0].astype(dtype)
-
-    def total(prediction, noise):
-        return link.distribution(name, prediction, data, noise).log_prob(reading).sum()
-
-    compiled = jax.jit(jax.value_and_grad(total, argnums=(0, 1)))
-    value, slopes = compiled(make_prediction(dtype), make_noise(link, dtype))
+    density, (prediction, noise, data, reading) = density_of(name, link, dtype)
+    data = trusting(data, TRUST.astype(dtype))
+    (value, _), slopes = slopes_of(density)(prediction, noise, data, reading)
     assert value.dtype == dtype
-    for slope in jax.tree.leaves((value, slopes)):
-        assert np.all(np.isfinite(slope))
+    assert all(np.isfinite(each).all() for each in jax.tree.leaves((value, slopes)))
 
 
 @each("link", [BetaLink(margin=1e-3), LogitNormalLink(margin=1e-3)])

@@ -14,14 +14,7 @@ from polar_bayes.errors import SceneError
 from polar_bayes.physics.coat import ClearCoat
 from polar_bayes.physics.dispersion import Sellmeier
 from polar_bayes.physics.instrument import AbstractInstrumentTerm
-from polar_bayes.physics.part import (
-    Part,
-    check_part,
-    check_setting,
-    like,
-    parameters_of,
-    value_of,
-)
+from polar_bayes.physics.part import Part, check_part, check_setting, like, parameters_of, value_of
 from polar_bayes.physics.stokes import Light
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 
@@ -64,9 +57,7 @@ def test_every_part_is_a_frozen_value_that_its_repr_makes_again(part: Part) -> N
 
 
 @each("part", PARTS.values(), ids=PARTS)
-def test_every_part_reads_parameters_that_have_a_prior_or_that_its_settings_name(
-    part: Part,
-) -> None:
+def test_every_part_reads_parameters_that_have_a_prior_or_that_its_settings_name(part):
     assert len(part.parameters) == len(set(part.parameters))
     named = {value for value in vars(part).values() if isinstance(value, str)}
     assert set(part.parameters) <= set(pb.PRIORS) | named

@@ -61,9 +61,7 @@ def stopped(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, str], No
 
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("verb", VERBS)
-def test_a_verb_runs_what_a_fit_runs_or_refuses_the_name(
-    verb: str, name: str, stopped: Callable[[str, str], None]
-) -> None:
+def test_a_verb_runs_what_a_fit_runs_or_refuses_the_name(verb, name, stopped):
     call, function = VERBS[verb]
     able = method_names(one=verb == "fit", many=verb != "fit")
     if name not in able:
@@ -82,9 +80,7 @@ def test_a_verb_runs_what_a_fit_runs_or_refuses_the_name(
 
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("command", ["fit", "map", "calibrate"])
-def test_a_command_hands_the_name_on(
-    command: str, name: str, monkeypatch: pytest.MonkeyPatch, tmp_path
-) -> None:
+def test_a_command_hands_the_name_on(command, name, monkeypatch, tmp_path):
     given: list[Any] = []
 
     def note(*_: object, **settings: object) -> None:

@@ -14,6 +14,7 @@ from synthetic_maps import make_maps
 from synthetic_results import make_result
 
 import polar_bayes as pb
+from polar_bayes.reporting.report import render
 from polar_bayes.results import KINDS
 
 SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
@@ -25,6 +26,9 @@ RESULTS = {
     "accuracy": make_accuracy,
     "map": lambda: make_maps({"roughness": np.linspace(0.0, 1.0, 12).reshape(3, 4)}),
 }
+FILES = {"fit": "result.nc", "calibration": "calibration.nc", "accuracy": "accuracy.nc"}
+"""What a report writes beside its page; a map is too large."""
+
 every_result = each(("name", "make"), RESULTS.items(), ids=RESULTS)
 
 
@@ -59,12 +63,22 @@ def test_every_result_survives_a_file_and_has_the_same_card(name, make, tmp_path
     assert repr(pb.show(found)) == repr(pb.show(result))
 
 
+@pytest.mark.usefixtures("unpainted")
 @every_result
 def test_every_result_has_a_page_that_stands_alone(name, make, tmp_path: Path) -> None:
-    page = pb.report(make(), tmp_path / "report").read_text()
-    assert Page(page).open == []
-    assert "<script" not in page
-    assert "http://" not in page.replace("http://www.w3.org", "")
+    folder, result = tmp_path / "report", make()
+    if name == "fit, point":
+        pb.report(result, folder)  # an older report is replaced
+    page = pb.report(result, folder)
+    assert page == folder / "index.html"
+    text = page.read_text()
+    assert Page(text).open == []
+    assert "<script" not in text
+    assert "http://" not in text.replace("http://www.w3.org", "")
+    # Beside it is the result itself, which makes the same page again, byte for byte.
+    files = {path.name for path in folder.iterdir()} - {"index.html"}
+    assert files == ({FILES[name.partition(",")[0]]} if name != "map" else set())
+    assert render(pb.load(folder / files.pop()) if files else result) == text
 
 
 def test_one_kind_of_result_is_not_taken_for_another(tmp_path: Path) -> None:
@@ -73,6 +87,11 @@ def test_one_kind_of_result_is_not_taken_for_another(tmp_path: Path) -> None:
     for kind, name in (("fit", "calibration"), ("accuracy", "calibration"), ("calibration", "fit")):
         with pytest.raises(pb.FitError, match=rf"{name}.nc: it holds no {kind}; give the file"):
             pb.load(tmp_path / f"{name}.nc", kind)
+    (tmp_path / "text.nc").write_text("nothing")
+    with pytest.raises(pb.FitError, match="cannot be read as netCDF; give the file that polar_bay"):
+        pb.load(tmp_path / "text.nc", "calibration")
+    with pytest.raises(pb.CaptureError, match="there is no such file"):
+        pb.load(tmp_path / "nowhere.nc")
 
 
 @each("kind", [kind for kind in KINDS if kind.reports], ids=lambda kind: kind.name)

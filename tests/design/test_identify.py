@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from numpyro import handlers
-from plates import LINKS, PLATE, plate_capture
+from plates import LINKS, PLATE, at_mirror, plate_capture
 from scipy.special import polygamma
 from textbook import plate_q
 
@@ -75,20 +75,21 @@ GLASS = {
 }
 
 
+def geometry() -> pb.Geometry:
+    angles = (ANGLES, np.full(12, 180.0), ANGLES, np.zeros(12))
+    return pb.Geometry(*map(jnp.asarray, angles))
+
+
 @pytest.fixture(scope="module")
 def glass() -> xr.Dataset:
     """A polished pane with errors of one percent."""
-    angles = (ANGLES, np.full(12, 180.0), ANGLES, np.zeros(12))
-    told = POLISHED.predict(GLASS, pb.Geometry(*map(jnp.asarray, angles)))
-    named = dict(zip(pb.Geometry._fields, angles, strict=False))
-    capture = xr.Dataset({name: ("view", angle) for name, angle in named.items()})
+    told = POLISHED.predict(GLASS, geometry())
     noise = 0.01 * np.random.default_rng(0).normal(size=(2, 12))
     readings = {
-        name: ("view", np.clip(np.asarray(told[name]) + error, -0.999, 0.999))
+        name: np.clip(np.asarray(told[name]) + error, -0.999, 0.999)
         for name, error in zip(("dop", "q"), noise, strict=True)
     }
-    readings["q_error"] = ("view", np.full(12, 0.01))
-    return capture.assign(readings).assign_attrs(name="glass")
+    return at_mirror(ANGLES, **readings, q_error=np.full(12, 0.01)).assign_attrs(name="glass")
 
 
 @pytest.fixture(scope="module")
@@ -106,16 +107,13 @@ def test_glass_does_not_tell_its_absorption(glass: xr.Dataset, of_glass: xr.Data
 
 
 @pytest.mark.thorough
-def test_the_papers_sum_is_that_of_slopes_and_concentrations(
-    glass: xr.Dataset, of_glass: xr.Dataset
-) -> None:
+def test_the_papers_sum_is_that_of_slopes_and_concentrations(glass, of_glass):
     """By differences, from the schedule as the paper prints it."""
     value = of_glass["value"]
     at = {name: float(value.sel(parameter=name)) for name in POLISHED.parameters}
-    geometry = pb.Geometry(ANGLES, np.full(12, 180.0), ANGLES, np.zeros(12))
 
     def dop(name: str, step: float) -> np.ndarray:
-        return np.asarray(POLISHED.predict({**at, name: at[name] + step}, geometry)["dop"])
+        return np.asarray(POLISHED.predict({**at, name: at[name] + step}, geometry())["dop"])
 
     scale = float(value.sel(parameter="concentration_scale"))
     concentration = 5.0 + scale * np.cos(np.radians(ANGLES))

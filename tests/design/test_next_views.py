@@ -7,16 +7,7 @@ import numpyro
 import pytest
 import xarray as xr
 from cases import each
-from design_lines import (
-    ASKED,
-    NOISE,
-    PRIOR,
-    angles,
-    line,
-    line_capture,
-    precision_of,
-    rows_of,
-)
+from design_lines import ASKED, NOISE, PRIOR, angles, line, line_capture, precision_of, rows_of
 from numpyro import distributions as dist
 from numpyro import handlers
 from plates import LINKS, PLATE, plate_capture

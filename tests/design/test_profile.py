@@ -8,11 +8,7 @@ from cases import each
 from design_lines import ASKED, NOISE, PRIOR, line, line_capture, precision_of, rows_of
 
 import polar_bayes as pb
-from polar_bayes.design.profile import (
-    KINDS,
-    likelihood_interval,
-    log_density_parts,
-)
+from polar_bayes.design.profile import KINDS, likelihood_interval, log_density_parts
 from polar_bayes.design.setup import make_design_problem
 from polar_bayes.inference.request import resolve
 

@@ -15,7 +15,6 @@ from synthetic_results import edit_provenance, make_result, replace
 import polar_bayes as pb
 from polar_bayes.diagnostics.convergence import json_summary, laplace_pareto_k, summary, verdict
 from polar_bayes.diagnostics.view import view_of
-from polar_bayes.errors import FitError
 
 
 def posterior_of(tree, name):
@@ -303,22 +302,6 @@ def test_json_is_valid_json(method: str) -> None:
     assert (said["parameters"]["roughness"]["r_hat"] is None) == (method == "point")
     for key in ("method", "model", "scene", "seed", "counts", "timings", "problems", "cautions"):
         assert key in said
-
-
-@pytest.mark.thorough
-def test_a_file_gives_the_same_table(tmp_path) -> None:
-    tree = make_result(discrepancy=True)
-    tree.to_netcdf(tmp_path / "r.nc", engine="netcdf4")
-    with xr.open_datatree(tmp_path / "r.nc", engine="netcdf4") as opened:
-        read = opened.load()
-    np.testing.assert_array_equal(summary(read).to_numpy(), summary(tree).to_numpy())
-    assert verdict(read) == verdict(tree)
-
-
-@each("wrong", [xr.DataTree(), xr.Dataset(), "fit.nc", None])
-def test_what_is_no_result_is_refused(wrong: object) -> None:
-    with pytest.raises(FitError, match="result: it holds no fit; give the tree"):
-        pb.summary(wrong)
 
 
 @each("method", ["importance"])

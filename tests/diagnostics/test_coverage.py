@@ -112,9 +112,7 @@ def test_the_image_may_be_read_in_pieces(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.thorough
-def test_maps_that_are_still_to_be_computed_are_computed_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_maps_that_are_still_to_be_computed_are_computed_once(monkeypatch):
     maps, calls = make_maps({"roughness": HALF}), []
 
     def late(block: np.ndarray) -> np.ndarray:

@@ -293,7 +293,7 @@ def test_an_answer_that_rests_on_smooth_errors_nobody_sees_is_a_problem() -> Non
 )
 def test_smooth_errors_that_are_seen_may_move_the_answer_but_not_be_large(
     amplitude, options, level, words
-) -> None:
+):
     seen = lambda shape: np.random.default_rng(0).normal(amplitude, 0.02, shape)  # noqa: E731
     row = criticize(_with_discrepancy(seen, **options)).loc["systematic errors"]
     assert row["level"] == level

@@ -40,9 +40,7 @@ def test_what_has_arguments_is_computed_once_for_each_of_them() -> None:
     assert curves(fit, "dop") is curves(fit, "dop")
 
 
-def test_a_report_checks_its_fit_once_and_takes_the_posterior_apart_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_report_checks_its_fit_once_and_takes_the_posterior_apart_once(monkeypatch):
     result = pool(make_result(**SMALL, materials=("a", "b", "c")), "roughness")
     checked, taken = [], Counter[str]()
     check, entries = Schema.check, parameters._entries

@@ -167,9 +167,7 @@ class Powers(NamedTuple):
     cross: mp.mpf
 
 
-def coated(
-    sin_squared: mp.mpf, films: list, coat: mp.mpf, absorbance: mp.mpf, n: mp.mpf
-) -> tuple[Powers, Powers]:
+def coated(sin_squared, films, coat, absorbance, n):
     """Reflectance and transmittance of films on a thick coat on a body: the sum of all bounces."""
     top = boundary(sin_squared, mp.mpf(1), films, coat)
     # From below the films stand in the other order; the same power passes.
@@ -203,13 +201,7 @@ def cross_product(a: mp.matrix, b: mp.matrix) -> mp.matrix:
     )
 
 
-def mirrored(
-    powers: Powers,
-    view: tuple[float, float],
-    light: tuple[float, float],
-    q: mp.mpf,
-    u: mp.mpf,
-) -> tuple[mp.mpf, mp.mpf, mp.mpf]:
+def mirrored(powers, view, light, q, u):
     """Stokes vector that a facet sends to the viewer, from fields along explicit axes."""
     towards, from_ = ray(*view), ray(*light)
     frames = []

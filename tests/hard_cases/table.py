@@ -3,8 +3,9 @@
 `python -m tests.hard_cases.table` prints it; `docs/hard_cases.md` holds what it printed.
 """
 
+import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import click
 import jax
@@ -33,8 +34,8 @@ class Case(NamedTuple):
         at: Its arguments; the gradient is taken in all of them.
         textbook: The usual formula.
         ours: This package's.
-        exact: The same with 50 digits, or the limit where the formula has none; None where only
-            a finite value and slope are asked for.
+        exact: Its value with 50 digits: the textbook's formula in mpmath, or a limit where that
+            has none; None where only a finite value and slope are asked for.
     """
 
     where: str
@@ -42,7 +43,7 @@ class Case(NamedTuple):
     at: tuple[float, ...]
     textbook: Callable
     ours: Callable
-    exact: Callable | None
+    exact: Callable | Literal["textbook"] | None = "textbook"
 
 
 # --- textbook forms, on whatever numbers they are given (`m` is jax.numpy or mpmath) ----------
@@ -135,9 +136,8 @@ def our_coated_contrast(zenith, n):
 
 def our_tilt(view, light):
     one = jnp.ones((1,), view.dtype)
-    return mirror_facet(Geometry(view * one, 180.0 * one, light * one, 0.0 * one)).tan_squared_tilt[
-        0
-    ]
+    geometry = Geometry(view * one, 180.0 * one, light * one, 0.0 * one)
+    return mirror_facet(geometry).tan_squared_tilt[0]
 
 
 def our_retroreflected(zenith, n):
@@ -180,113 +180,64 @@ def exact_sky_dolp(n):
     return sum(s - p for s, p in pairs) / sum(s + p for s, p in pairs)
 
 
+def our_transmittance(zenith, n):
+    return Stack(n).transmission(*angles(zenith)).mean
+
+
+def our_log_density(tan_squared, roughness):
+    return jnp.log(Beckmann().density(tan_squared, roughness))
+
+
+def our_beta_density(mean, concentration, value):
+    return MeanConcentrationBeta(mean, concentration).log_prob(value)
+
+
+def exactly(value):
+    """A limit where the formula has no value."""
+    return lambda *_: mp.mpf(value)
+
+
 CASES = (
-    Case(
-        "89.99 degrees",
-        "DoLP of reflection",
-        (89.99, 1.5),
-        reflected_dolp,
-        our_reflected_dolp,
-        lambda z, n: reflected_dolp(z, n, mp),
-    ),
-    Case(
-        "n = 1.000001",
-        "DoLP of reflection",
-        (50.0, 1.000001),
-        reflected_dolp,
-        our_reflected_dolp,
-        lambda z, n: reflected_dolp(z, n, mp),
-    ),
+    Case("89.99 degrees", "DoLP of reflection", (89.99, 1.5), reflected_dolp, our_reflected_dolp),
+    Case("n = 1.000001", "DoLP of reflection", (50, 1.000001), reflected_dolp, our_reflected_dolp),
     Case("n = 1", "DoLP under two facets", (1.0,), textbook_sky_dolp, sky_dolp, exact_sky_dolp),
+    Case("0.01 degrees", "DoLP of exit", (0.01, 1.5), exit_dolp, our_exit_dolp),
+    Case("89.9999 degrees", "transmittance", (89.9999, 1.5), transmitted, our_transmittance),
+    Case("0.01 degrees", "contrast of s and p", (0.01, 1.5), contrast, our_contrast),
     Case(
-        "0.01 degrees",
-        "DoLP of exit",
-        (0.01, 1.5),
-        exit_dolp,
-        our_exit_dolp,
-        lambda z, n: exit_dolp(z, n, mp),
+        "0.01 degrees", "contrast under a clear coat", (0.01, 1.7),
+        coated_contrast, our_coated_contrast,
     ),
     Case(
-        "89.9999 degrees",
-        "transmittance",
-        (89.9999, 1.5),
-        transmitted,
-        lambda z, n: Stack(n).transmission(*angles(z)).mean,
-        lambda z, n: transmitted(z, n, mp),
+        "0.0001 degrees from the mirror direction", "squared slope of the facet", (45.0001, 45.0),
+        tilt, our_tilt,
     ),
     Case(
-        "0.01 degrees",
-        "contrast of s and p",
-        (0.01, 1.5),
-        contrast,
-        our_contrast,
-        lambda z, n: contrast(z, n, mp),
+        "roughness 0.05, slope 1", "log density of facets", (1.0, 0.05),
+        lambda t, r: jnp.log(density(t, r)), our_log_density, None,
     ),
     Case(
-        "0.01 degrees",
-        "contrast under a clear coat",
-        (0.01, 1.7),
-        coated_contrast,
-        our_coated_contrast,
-        lambda z, n: coated_contrast(z, n, mp),
+        "viewer = light", "u of reflected light, u = 0.5 coming in", (30.0, 1.5),
+        retroreflected, our_retroreflected, exactly("0.5"),
     ),
     Case(
-        "0.0001 degrees from the mirror direction",
-        "squared slope of the facet",
-        (45.0001, 45.0),
-        tilt,
-        our_tilt,
-        lambda v, w: tilt(v, w, mp),
+        "no light", "degree of polarization", (0.0, 0.0),
+        lambda q, u: 1e-12 + jnp.sqrt(q**2 + u**2), degree_of_linear_polarization,
+        exactly("1e-12"),
     ),
     Case(
-        "roughness 0.05, slope 1",
-        "log density of facets",
-        (1.0, 0.05),
-        lambda t, r: jnp.log(density(t, r)),
-        lambda t, r: jnp.log(Beckmann().density(t, r)),
-        None,
+        "fraction 0 of no surface light", "1 + share of the surface", (0.0, 0.0),
+        lambda f, s: 1.0 + (1 - f) * s / ((1 - f) * s + f), our_share, None,
     ),
     Case(
-        "viewer = light",
-        "u of reflected light, u = 0.5 coming in",
-        (30.0, 1.5),
-        retroreflected,
-        our_retroreflected,
-        lambda z, n: mp.mpf("0.5"),
+        "concentration 1e8", "Beta log density", (0.3, 1e8, 0.30005),
+        beta_density, our_beta_density,
     ),
     Case(
-        "no light",
-        "degree of polarization",
-        (0.0, 0.0),
-        lambda q, u: 1e-12 + jnp.sqrt(q**2 + u**2),
-        degree_of_linear_polarization,
-        lambda q, u: mp.mpf("1e-12"),
+        "reading at full scale", "scale of intensity noise", (0.02, 1.0, 0.5),
+        lambda b, i, c: b * (1 - i) ** -0.5 * c**-0.5, ScaleSchedule().scale, None,
     ),
-    Case(
-        "fraction 0 of no surface light",
-        "1 + share of the surface",
-        (0.0, 0.0),
-        lambda f, s: 1.0 + (1 - f) * s / ((1 - f) * s + f),
-        our_share,
-        None,
-    ),
-    Case(
-        "concentration 1e8",
-        "Beta log density",
-        (0.3, 1e8, 0.30005),
-        beta_density,
-        lambda m, k, x: MeanConcentrationBeta(m, k).log_prob(x),
-        lambda m, k, x: beta_density(m, k, x, mp),
-    ),
-    Case(
-        "reading at full scale",
-        "scale of intensity noise",
-        (0.02, 1.0, 0.5),
-        lambda b, i, c: b * (1 - i) ** -0.5 * c**-0.5,
-        lambda b, i, c: ScaleSchedule().scale(b, i, c),
-        None,
-    ),
-)
+)  # fmt: skip
 
 
 HEADER = (
@@ -304,7 +255,8 @@ def error(case: Case, formula: Callable, dtype: type) -> float:
     if case.exact is None:
         return 0.0
     # The exact value belongs to the numbers as they were rounded.
-    exact = case.exact(*(mp.mpf(float(number)) for number in at))
+    with_digits = case.exact if case.exact != "textbook" else functools.partial(case.textbook, m=mp)
+    exact = with_digits(*(mp.mpf(float(number)) for number in at))
     return float(abs(mp.mpf(float(value)) - exact) / abs(exact))
 
 

@@ -50,9 +50,7 @@ def relative_error(value: object, truth: list, floor: float = 1e-60) -> np.ndarr
     return np.array(errors)
 
 
-def assert_accurate(
-    value: object, truth: list, dtype: type, names: list[str], floor: float = 1e-60
-) -> None:
+def assert_accurate(value, truth, dtype, names, floor=1e-60):
     assert np.asarray(value).dtype == dtype
     error = relative_error(value, truth, floor)
     worst = int(np.argmax(error))
@@ -240,9 +238,7 @@ def test_scene_of_a_rough_surface(dtype: type) -> None:
 
 @PRECISIONS
 @each("mixing", [StokesMixing(), DopMixing(), DopMixing(signed=True)])
-def test_scene_of_a_plate_over_a_diffuse_body(
-    mixing: StokesMixing | DopMixing, dtype: type
-) -> None:
+def test_scene_of_a_plate_over_a_diffuse_body(mixing, dtype):
     """q and u against the degree of polarization of the stronger part."""
     cases = every_case(dtype, exact=True)
     keep = [i for i, name in enumerate(cases.names) if cases.materials[i, 0] == dtype(0.1)]

@@ -4,7 +4,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -146,9 +145,7 @@ def test_who_runs_for_the_first_time_keeps_nobody_from_tracing(gate: Gate) -> No
 
 
 @pytest.mark.thorough
-def test_what_waits_in_the_queue_is_compiled_by_who_needs_it(
-    gate: Gate, slow_to_compile: None
-) -> None:
+def test_what_waits_in_the_queue_is_compiled_by_who_needs_it(gate, slow_to_compile):
     """A compilation that nobody waits for any more holds up no other one."""
 
     def slow(x: jax.Array) -> jax.Array:
@@ -199,9 +196,7 @@ def test_the_memory_of_a_program_is_known_before_it_runs() -> None:
     assert 8.0e6 <= found <= 1.7e7
 
 
-def test_a_program_that_the_memory_cannot_hold_is_refused_and_not_run(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_program_that_the_memory_cannot_hold_is_refused_and_not_run(monkeypatch):
     def many(x: jax.Array) -> jax.Array:
         return jnp.sort(jnp.broadcast_to(x, (10**12, 3)), axis=0)
 
@@ -216,9 +211,7 @@ def test_a_program_that_the_memory_cannot_hold_is_refused_and_not_run(
 
 @pytest.mark.thorough
 @each("method", ["point", "laplace", pb.methods.Importance()])
-def test_a_fit_is_refused_in_one_line_where_memory_is_short(
-    method: object, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fit_is_refused_in_one_line_where_memory_is_short(method, monkeypatch):
     asked = {"model": line, "links": {"q": pb.links.StokesLink()}}
     views = np.linspace(20.0, 70.0, 9)  # a layout of its own: no other test has its programs
     readings = plate_capture(views, 0.05, seed=0)
@@ -231,9 +224,7 @@ def test_a_fit_is_refused_in_one_line_where_memory_is_short(
         pb.fit(readings, method=method, **asked)
 
 
-def test_the_limit_is_that_of_the_container_where_it_is_lower(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_limit_is_that_of_the_container_where_it_is_lower(tmp_path, monkeypatch):
     machine = compile.memory_limit()
     assert machine is not None
     assert machine > 1e8

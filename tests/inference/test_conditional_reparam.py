@@ -10,6 +10,7 @@ import numpyro
 import pytest
 import xarray as xr
 from numpyro import distributions as dist
+from plates import at_mirror
 from scipy import stats
 
 import polar_bayes as pb
@@ -40,19 +41,18 @@ def linear(data, scene, priors, links):
 def capture() -> xr.Dataset:
     q = 0.3 + 0.2 * BASIS[0] - 0.1 * BASIS[2]
     q = np.clip(q + np.random.default_rng(3).normal(0.0, NOISE, VIEWS), -1.0, 1.0)
-    angles = {"view_zenith": ZENITH, "view_azimuth": np.full(VIEWS, 180.0)}
-    angles |= {"light_zenith": ZENITH, "light_azimuth": np.zeros(VIEWS)}
-    valid = np.arange(VIEWS) != 4
-    return pb.capture.validate(
-        xr.Dataset({name: ("view", x) for name, x in {**angles, "q": q, "valid": valid}.items()})
-    )
+    return pb.capture.validate(at_mirror(ZENITH, q=q, valid=np.arange(VIEWS) != 4))
+
+
+def found(capture: xr.Dataset, model) -> tuple[ConditionalReparam | None, Observations]:
+    request = resolve(capture, model, SCENE, None, LINKS, None, 0, "double")
+    data = observe(request.capture)
+    return find_coefficients(compile_program(request.bind(SCENE), data), data), data
 
 
 @pytest.fixture(scope="module")
 def made(capture: xr.Dataset) -> tuple[ConditionalReparam, Observations]:
-    request = resolve(capture, linear, SCENE, None, LINKS, None, 0, "double")
-    data = observe(request.capture)
-    reparam = find_coefficients(compile_program(request.bind(SCENE), data), data)
+    reparam, data = found(capture, linear)
     assert reparam is not None
     assert reparam.names == ("w",)
     return reparam, data
@@ -64,12 +64,19 @@ def test_the_density_is_that_of_the_program_with_the_volume_of_the_map(made) -> 
     half = random.normal(size=(4, 4))
     given = reparam.inputs(random.normal(size=4), half @ half.T + np.eye(4), data)
     x = jnp.asarray(random.normal(size=4))
-    z, log_volume = reparam.forward(x, given)
+
+    @jax.jit
+    def both(x: jax.Array) -> tuple[jax.Array, ...]:
+        z, log_volume = reparam.forward(x, given)
+        jacobian = jax.jacfwd(lambda x: reparam.forward(x, given)[0])(x)
+        there = reparam.program.potential(z, data)
+        return z, log_volume, jacobian, there, reparam.potential(x, given)
+
+    z, log_volume, jacobian, there, here = both(x)
     np.testing.assert_array_equal(z[reparam.others], x[reparam.others])
-    volume = np.linalg.slogdet(jax.jacfwd(lambda x: reparam.forward(x, given)[0])(x))[1]
+    volume = np.linalg.slogdet(jacobian)[1]
     np.testing.assert_allclose(log_volume, volume, rtol=1e-12)
-    expected = reparam.program.potential(z, data) - volume
-    np.testing.assert_allclose(reparam.potential(x, given), expected, rtol=1e-12)
+    np.testing.assert_allclose(here, there - volume, rtol=1e-12)
 
 
 def test_where_the_model_is_linear_coefficients_are_integrated_out(made, capture) -> None:
@@ -80,6 +87,7 @@ def test_where_the_model_is_linear_coefficients_are_integrated_out(made, capture
     basis, q = BASIS[:, used], capture["q"].to_numpy()[used]
     covariance = NOISE**2 * np.eye(used.sum()) + WIDTH**2 * basis.T @ basis
     random, differences = np.random.default_rng(1), []
+    potential = jax.jit(lambda x: reparam.potential(x, given))
     for level in (-0.4, 0.1, 0.5, 0.9):
         for _ in range(2):
             c = random.normal(size=3)
@@ -88,14 +96,12 @@ def test_where_the_model_is_linear_coefficients_are_integrated_out(made, capture
             mean = level**2 + 0.1 * basis.sum(axis=0)
             marginal = stats.multivariate_normal(mean, covariance).logpdf(q)
             expected = 0.5 * c @ c - marginal - stats.norm(0.5, 0.2).logpdf(level)
-            differences.append(float(reparam.potential(jnp.asarray(x), given)) - expected)
+            differences.append(float(potential(jnp.asarray(x))) - expected)
     np.testing.assert_allclose(differences, differences[0], atol=1e-9)
 
 
 def test_models_without_such_coefficients_keep_their_coordinates(capture: xr.Dataset) -> None:
-    request = resolve(capture, "per_material", SCENE, None, LINKS, None, 0, "double")
-    data = observe(request.capture)
-    assert find_coefficients(compile_program(request.bind(SCENE), data), data) is None
+    assert found(capture, "per_material")[0] is None
 
 
 def posterior_of_index(link: pb.links.AbstractLink | None, method: str) -> tuple[float, float]:

@@ -91,11 +91,7 @@ OF_CALIBRATIONS = (
     lambda tree: pb.show(tree)._repr_html_(),
     lambda tree: pb.calibration.compare_calibrations({"this": tree, "that": CALIBRATION}),
 )
-OF_STUDIES = (
-    pb.summary,
-    pb.benchmark.accuracy_sentences,
-    lambda tree: pb.show(tree)._repr_html_(),
-)
+OF_STUDIES = (pb.summary, pb.benchmark.accuracy_sentences, lambda tree: pb.show(tree)._repr_html_())
 
 
 def check_mutations(trees, functions, random, count):
@@ -191,10 +187,7 @@ def test_provenance_that_is_no_mapping_is_refused(odd):
             {"prior_probability": {"roughness": ["x"]}},
             r"prior_probability.roughness\[0\]: it is 'x', not a number",
         ),
-        (
-            {"tails": {**TAILS, "ess": 0}},
-            "tails.ess: it is 0, not a number a",
-        ),
+        ({"tails": {**TAILS, "ess": 0}}, "tails.ess: it is 0, not a number a"),
         (
             {"tails": {**TAILS, "shares": {"a": [[0.1]]}}},
             r"tails.shares.a\[0\]: .*, not a share below",
@@ -434,16 +427,6 @@ def test_a_flipped_bit_is_an_error_and_no_value(tmp_path, part):
     (tmp_path / "damaged.nc").write_bytes(content)
     with pytest.raises(pb.FitError, match=r"damaged\.nc: its checksum is wrong"):
         pb.load(tmp_path / "damaged.nc")
-
-
-@pytest.mark.thorough
-def test_a_result_edited_elsewhere_has_no_checksum(tmp_path):
-    pb.save(RESULTS[1], tmp_path / "fit.nc")
-    with xr.open_datatree(tmp_path / "fit.nc", engine="netcdf4") as opened:
-        tree = opened.load()
-    del tree["prior"]
-    tree.to_netcdf(tmp_path / "edited.nc", engine="netcdf4")
-    assert "prior" not in pb.load(tmp_path / "edited.nc").children
 
 
 def test_a_result_is_no_capture(tmp_path):

@@ -9,11 +9,9 @@ from cases import each
 from compilations import compilations
 from numpyro import distributions as dist
 from plates import LINKS, PLATE
-from toy_models import NOISE, capture, line
+from toy_models import NOISE, capture, line, problem
 
 import polar_bayes as pb
-from polar_bayes.inference.problem import Problem, make_problem
-from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import Observations
 from polar_bayes.progress import no_progress
 
@@ -35,11 +33,6 @@ def ends(data, scene, priors, links) -> None:
         x = np.linspace(-1.0, 1.0, data.shape[-1])
         mean = sum(values[1:], values[0] * (weights[0] * x + weights[1] * x**2))
         numpyro.sample("q", dist.Normal(mean, NOISE), obs=data.readings["q"])
-
-
-def problem(model, precision: str = "double") -> Problem:
-    request = resolve(capture(), model, PLATE, None, LINKS, 90.0, 0, precision)
-    return make_problem(request, jax.random.key(0))
 
 
 def test_the_density_is_that_of_the_others() -> None:
@@ -64,7 +57,7 @@ def test_the_density_is_that_of_the_others() -> None:
 @each("precision", ["double", "single"])
 def test_densities_are_smooth_at_the_ends_of_supports(precision: str) -> None:
     with jax.enable_x64(precision == "double"):
-        here = problem(ends, precision)
+        here = problem(ends, precision=precision)
 
         def slope(z: jax.Array, data: Observations) -> tuple[jax.Array, tuple]:
             value, gradient = jax.value_and_grad(here.program.potential)(z, data)

@@ -39,7 +39,7 @@ def problem_of(capture: xr.Dataset, scene: str, *, padded: bool) -> Problem:
 
 @pytest.mark.parametrize(
     "scene",
-    [x if x == "picture" else pytest.param(x, marks=pytest.mark.thorough) for x in SETUPS],
+    [x if x == "goniometer" else pytest.param(x, marks=pytest.mark.thorough) for x in SETUPS],
 )
 def test_padding_changes_a_density_and_its_slope_by_rounding_only(scene: str) -> None:
     capture = capture_of(scene)

@@ -6,15 +6,15 @@ import numpy as np
 import numpyro
 import pytest
 import xarray as xr
-from cases import each
 from numpyro import distributions as dist
+from plates import at_mirror
 from scipy import stats
 
 import polar_bayes as pb
 from polar_bayes.inference.conditional_reparam import ConditionalReparam, find_coefficients
 from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.program import compile_program
-from polar_bayes.inference.request import resolve
+from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.sum_reparam import find_sum
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.priors import Beta, HalfNormal
@@ -49,15 +49,15 @@ def bounded(data, scene, priors, links):
 @pytest.fixture(scope="module")
 def capture() -> xr.Dataset:
     q = 0.9 - 0.025 + np.random.default_rng(3).normal(0.0, NOISE, VIEWS)
-    angles = {"view_zenith": ZENITH, "view_azimuth": np.full(VIEWS, 180.0)}
-    angles |= {"light_zenith": ZENITH, "light_azimuth": np.zeros(VIEWS)}
-    return pb.capture.validate(
-        xr.Dataset({name: ("view", x) for name, x in {**angles, "q": q}.items()})
-    )
+    return pb.capture.validate(at_mirror(ZENITH, q=q))
+
+
+def asked(capture: xr.Dataset, model=shares, precision: str = "double") -> Request:
+    return resolve(capture, model, SCENE, None, LINKS, None, 0, precision)
 
 
 def made(capture: xr.Dataset, precision: str = "double") -> tuple[ConditionalReparam, Observations]:
-    request = resolve(capture, shares, SCENE, None, LINKS, None, 0, precision)
+    request = asked(capture, precision=precision)
     data = observe(request.capture)
     data = data if precision == "double" else data.in_single_precision()
     program = compile_program(request.bind(SCENE), data)
@@ -95,7 +95,9 @@ def test_the_density_is_that_of_the_program_with_the_volume_of_the_map(capture) 
         np.testing.assert_allclose(back[reparam.others], x[reparam.others], rtol=1e-9)
 
 
-@each("precision", ["double", "single"])
+@pytest.mark.parametrize(
+    "precision", ["double", pytest.param("single", marks=pytest.mark.thorough)]
+)
 def test_it_is_smooth_far_out(capture, precision: str) -> None:
     """Where a share is a hundred-thousandth of the other, or the sum ten times what is likely."""
     with jax.enable_x64(precision == "double"):
@@ -119,8 +121,7 @@ def test_it_is_smooth_far_out(capture, precision: str) -> None:
 
 
 def test_what_is_held_keeps_its_coordinates(capture) -> None:
-    request = resolve(capture, shares, SCENE, None, LINKS, None, 0, "double")
-    problem = make_problem(request, jax.random.key(0)).hold({"leak": 0.0})
+    problem = make_problem(asked(capture), jax.random.key(0)).hold({"leak": 0.0})
     sums = find_sum(problem.program)
     assert sums is not None
     x = jnp.asarray(np.random.default_rng(1).normal(size=problem.program.size))
@@ -130,7 +131,7 @@ def test_what_is_held_keeps_its_coordinates(capture) -> None:
 
 
 def test_bounded_shares_keep_their_coordinates(capture) -> None:
-    request = resolve(capture, bounded, SCENE, None, LINKS, None, 0, "double")
+    request = asked(capture, bounded)
     program = compile_program(request.bind(SCENE), observe(request.capture))
     assert set(program.summed) == {"leak", "body"}
     assert find_sum(program) is None

@@ -176,9 +176,3 @@ def test_a_model_that_cannot_work_is_refused(capture: xr.Dataset, model, said: s
     with pytest.raises(pb.FitError, match=said) as caught:
         fit(capture, model=model)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.thorough
-def test_a_prior_that_the_model_does_not_read_is_refused(capture: xr.Dataset) -> None:
-    with pytest.raises(pb.FitError, match="no such parameter in this model"):
-        fit(capture, priors={"refractive_index_spread": dist.HalfNormal(0.1)})

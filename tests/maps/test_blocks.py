@@ -51,9 +51,7 @@ def assert_same_bits(one: xr.Dataset, other: xr.Dataset) -> None:
 
 @pytest.mark.thorough
 @each("block", [100, 43, 17])
-def test_blocks_of_any_size_give_the_same_bits(
-    image: xr.Dataset, plan: MapPlan, whole: xr.Dataset, block: int
-) -> None:
+def test_blocks_of_any_size_give_the_same_bits(image, plan, whole, block):
     assert_same_bits(mapped(image, plan, block), whole)
 
 
@@ -68,9 +66,7 @@ def test_a_block_in_which_nothing_was_read_is_masked(image: xr.Dataset, plan: Ma
 
 
 @pytest.mark.thorough
-def test_a_pixel_alone_gets_the_same_bits(
-    image: xr.Dataset, plan: MapPlan, whole: xr.Dataset
-) -> None:
+def test_a_pixel_alone_gets_the_same_bits(image, plan, whole):
     sampled = np.argwhere((whole["method"] == MethodUsed.NUTS).values)[-1]
     for y, x in ((0, 0), (2, 42), sampled):
         place = {"y": slice(y, y + 1), "x": slice(x, x + 1)}
@@ -79,9 +75,7 @@ def test_a_pixel_alone_gets_the_same_bits(
 
 
 @pytest.mark.thorough
-def test_a_mirrored_image_has_mirrored_modes(
-    image: xr.Dataset, plan: MapPlan, whole: xr.Dataset
-) -> None:
+def test_a_mirrored_image_has_mirrored_modes(image, plan, whole):
     mirrored = mapped(image.isel(x=slice(None, None, -1)), plan).isel(x=slice(None, None, -1))
     # Draws follow the number of a pixel, which has changed; where it climbs to does not.
     for name in ("steps", "condition"):
@@ -114,9 +108,7 @@ def compiled_already(plan: MapPlan, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.thorough
-def test_bad_pixels_are_told_apart_and_poison_no_neighbor(
-    image: xr.Dataset, whole: xr.Dataset, compiled_already: None
-) -> None:
+def test_bad_pixels_are_told_apart_and_poison_no_neighbor(image, whole, compiled_already):
     bad = image.copy(deep=True)
     views = image.sizes["view"]
     valid = np.ones(image["q"].shape, bool)

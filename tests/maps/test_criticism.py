@@ -90,9 +90,7 @@ def inferred(compiled_in_haste: None) -> xr.Dataset:
         ("a smooth error", Criticism.RESIDUALS_PROBLEM),
     ],
 )
-def test_where_errors_are_known_a_wrong_pixel_is_contradicted(
-    known: xr.Dataset, kind: str, check: Criticism
-) -> None:
+def test_where_errors_are_known_a_wrong_pixel_is_contradicted(known, kind, check):
     flags = contradicted(known, kind)
     assert flags.size == PIXELS
     assert (flags & check != 0).all()
@@ -107,9 +105,7 @@ def test_where_errors_are_known_a_wrong_pixel_is_contradicted(
         ("a smooth error", Criticism.RESIDUALS_PROBLEM),
     ],
 )
-def test_where_errors_are_inferred_a_wrong_pixel_is_contradicted(
-    inferred: xr.Dataset, kind: str, check: Criticism
-) -> None:
+def test_where_errors_are_inferred_a_wrong_pixel_is_contradicted(inferred, kind, check):
     flags = contradicted(inferred, kind)
     assert np.sum(flags & check != 0) > 0.9 * PIXELS
 
@@ -170,9 +166,7 @@ def test_few_are_where_errors_are_inferred() -> None:
     assert_few_contradicted(pb.fit_pixels(image, **INFERRED))
 
 
-def linear(
-    views: np.ndarray, groups: int, size: int, missing: float = 0.0, count: int = 20_000
-) -> tuple[Fitted, list[np.ndarray]]:
+def linear(views, groups, size, missing=0.0, count=20_000):
     """Pixels whose readings are smooth in the parameters, fitted where these are near zero."""
     rng = np.random.default_rng(1)
     x = np.linspace(-1.0, 1.0, views.size)
@@ -189,9 +183,7 @@ def linear(
     ("views", "groups", "size", "missing"),
     [(6, 1, 2, 0.0), (6, 1, 4, 0.0), (18, 1, 2, 0.3), (12, 3, 5, 0.1)],
 )
-def test_residuals_of_noise_alone_are_a_problem_once_in_250(
-    views: int, groups: int, size: int, missing: float
-) -> None:
+def test_residuals_of_noise_alone_are_a_problem_once_in_250(views, groups, size, missing):
     fitted, kernels = linear(np.linspace(20.0, 80.0, views), groups, size, missing)
     p_value = residual_tail(fitted, kernels, np.ones(len(fitted.scores)))
     p_value = p_value[np.isfinite(p_value)]

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from cases import each
 from plate_images import ASKED, NAMES, NOISE, VIEWS, on_a_grid, planned, plate_image
 from toy_models import BEND, bent, squared
 
@@ -30,29 +31,14 @@ def weighted(image: xr.Dataset, compiled_in_haste: None) -> xr.Dataset:
     return pb.fit_pixels(image, method="importance", **ASKED)
 
 
-@pytest.mark.thorough
-def test_chains_in_every_pixel_make_a_map(image: xr.Dataset, weighted: xr.Dataset) -> None:
-    chains = pb.fit_pixels(image.isel(y=[0], x=[0, 1]), method=pb.methods.Nuts(), **ASKED)
-    assert (chains["method"] == MethodUsed.NUTS).all()
-    assert (chains["status"] == Status.GOOD).all()
-    for name in NAMES:
-        one, other = chains[name].values[0], weighted[name].values[0, :2]
-        worth = 1.0 / chains["ess"].values[0]
-        worth += 1.0 / weighted["ess"].values[0, :2]
-        # Four standard normals, in two pairs: the largest is above 4 in 3 of ten thousand cases.
-        error = weighted[f"{name}_sd"].values[0, :2] * np.sqrt(worth)
-        assert (np.abs(one - other) < 4.0 * error).all()
-
-
 class OneByOne(pb.methods.Importance):
     """The same settings, for one pixel after another."""
 
     run_batch = AbstractMethod.run_batch
 
 
-@pytest.mark.parametrize(
-    "kind", [pytest.param(OneByOne, marks=pytest.mark.thorough), pb.methods.Importance]
-)
+@pytest.mark.thorough
+@each("kind", [OneByOne, pb.methods.Importance])
 def test_importance_sampling_makes_a_map(image: xr.Dataset, kind: type) -> None:
     method = kind(draws=1024)
     some = image.isel(y=[0, 1], x=[0, 1])
@@ -73,9 +59,7 @@ def test_importance_sampling_makes_a_map(image: xr.Dataset, kind: type) -> None:
     assert (alone[NAMES[0]].values == maps[NAMES[0]].values[:1, :1]).all()
 
 
-def test_a_pixel_without_a_mode_is_searched_by_the_method_of_one_capture(
-    image: xr.Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pixel_without_a_mode_is_searched_by_the_method_of_one_capture(image, monkeypatch):
     one = image.isel(y=[0], x=[0])
     monkeypatch.setattr(importance, "find_all_modes", lambda *_: (np.zeros(0, int), None))
     maps = pb.fit_pixels(one, method=pb.methods.Importance(draws=1024), **ASKED)
@@ -124,13 +108,3 @@ def test_the_map_says_how_it_was_made(weighted: xr.Dataset, tmp_path: Path) -> N
     assert "importance sampling from mixtures at all modes" in page
     assert len(METHODS_USED) == len(MethodUsed)  # each has a color
     assert "all by weighted draws of normal approximations" in page
-
-
-@pytest.mark.thorough
-def test_files_give_the_same_map(image: xr.Dataset, weighted: xr.Dataset, tmp_path: Path) -> None:
-    image.to_zarr(tmp_path / "image.zarr", consolidated=False)
-    stored = pb.maps.map_file(
-        tmp_path / "image.zarr", tmp_path / "map.zarr", method="importance", **ASKED
-    )
-    for name in weighted.data_vars:
-        np.testing.assert_array_equal(stored[name], weighted[name], err_msg=str(name))

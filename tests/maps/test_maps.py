@@ -17,7 +17,7 @@ from scipy import optimize, stats
 
 import polar_bayes as pb
 from polar_bayes.inference.batch_modes import find_modes
-from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status
+from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.inference.program import Program
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.maps.fit_map import MapPlan, blank, fit_pixels
@@ -94,9 +94,7 @@ GOAL = 1e-4
 """Posterior sds within which a search for modes ends."""
 
 
-def assert_modes_agree(
-    plan: MapPlan, pixels: ObservationBatch, covariance: Callable | None = None
-) -> int:
+def assert_modes_agree(plan, pixels, covariance=None):
     """Of all pixels that arrived; how many did."""
     found = find_modes(plan.engine, pixels)
     twin = Twin(plan.engine.program)
@@ -123,9 +121,7 @@ def guide(plan: MapPlan) -> Callable:
 
 
 @pytest.mark.thorough
-def test_five_hundred_pixels_have_the_mode_and_the_covariance_of_numpyros_guide(
-    plan: MapPlan, guide: Callable
-) -> None:
+def test_five_hundred_pixels_have_the_mode_and_the_covariance_of_numpyros_guide(plan, guide):
     rng = np.random.default_rng(1)
     noise = np.exp(rng.uniform(np.log(3e-3), np.log(0.1), (20, 25)))
     assert assert_modes_agree(plan, stacked(plate_image(20, 25, noise=noise), plan), guide) == 500
@@ -149,9 +145,7 @@ def test_hard_pixels_have_them_too(plan: MapPlan, guide: Callable, hard: str) ->
 
 
 @pytest.mark.thorough
-def test_on_a_bent_ridge_some_arrive_and_the_others_say_that_they_did_not(
-    plan: MapPlan, guide: Callable
-) -> None:
+def test_on_a_bent_ridge_some_arrive_and_the_others_say_that_they_did_not(plan, guide):
     """One reading a thousand times better than the rest: damped steps creep along its curve."""
     image = plate_image(2, 5, noise=0.1, seed=4)
     image["q_error"][..., 3] = 1e-4
@@ -327,16 +321,3 @@ def test_what_cannot_be_mapped_is_refused_with_the_mend(change, settings: dict, 
     with pytest.raises(pb.PolarBayesError, match=says) as caught:
         fit_pixels(change(image), **{**ASKED, **settings})
     assert "\n" not in str(caught.value)
-
-
-@each(
-    ("setting", "says"),
-    [
-        ({"draws": 100}, "draws is 100; give 64, 128, 256 or so"),
-        ({"draws": 32}, "draws is 32; give 64, 128, 256 or so"),
-        ({"candidates": 2}, "candidates is 2; give at least 8"),
-    ],
-)
-def test_settings_outside_their_range_are_refused(setting: dict, says: str) -> None:
-    with pytest.raises(pb.FitError, match=f"CorrectedLaplace: {says}"):
-        CorrectedLaplace(**setting)

@@ -132,16 +132,12 @@ def test_regions_of_a_store_and_pixels_without_an_answer(maps: xr.Dataset, tmp_p
         (np.ones((SIDE, SIDE), int), 7, "no region has the label 7; give one of 1"),
     ],
 )
-def test_labels_that_do_not_fit_are_refused(
-    maps: xr.Dataset, labels: np.ndarray, against: object, what: str
-) -> None:
+def test_labels_that_do_not_fit_are_refused(maps, labels, against, what):
     with pytest.raises(pb.FitError, match=what):
         pb.maps.region_means(maps, labels, against=against)
 
 
-def test_the_command_reads_labels_from_a_picture(
-    maps: xr.Dataset, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_the_command_reads_labels_from_a_picture(maps, tmp_path, capsys):
     store, picture = tmp_path / "map.zarr", tmp_path / "labels.png"
     maps.to_zarr(store, consolidated=False)
     Image.fromarray(np.uint8(quarters())).save(picture)
@@ -165,26 +161,20 @@ def test_a_parameter_of_several_values_has_a_row_for_each() -> None:
     assert table["pixels"].tolist() == [12, 12]
 
 
-@pytest.mark.parametrize(
-    ("mode", "what"),
-    [("RGB", "not gray values"), ("F", "and type float32"), (None, "cannot be read")],
-)
-def test_pictures_that_are_no_labels_are_refused(
-    tmp_path: Path, mode: str | None, what: str
-) -> None:
-    file = tmp_path / "labels.tiff"
-    if mode is None:
-        file.write_text("no picture")
-    else:
-        Image.new(mode, (4, 3)).save(file)
+NO_LABELS = {
+    "not gray values": lambda file: Image.new("RGB", (4, 3)).save(file),
+    "and type float32": lambda file: Image.new("F", (4, 3)).save(file),
+    "cannot be read": lambda file: file.write_text("no picture"),
+    "and type float64": lambda file: np.save(file, np.ones((3, 4))),
+}
+
+
+@pytest.mark.parametrize("what", NO_LABELS)
+def test_files_that_are_no_labels_are_refused(tmp_path: Path, what: str) -> None:
+    file = tmp_path / ("labels.npy" if "float64" in what else "labels.tiff")
+    NO_LABELS[what](file)
     with pytest.raises(pb.CaptureError, match=what):
         pb.maps.load_labels(file)
-
-
-def test_an_array_of_no_labels_is_refused(tmp_path: Path) -> None:
-    np.save(tmp_path / "labels.npy", np.ones((3, 4)))
-    with pytest.raises(pb.CaptureError, match="and type float64"):
-        pb.maps.load_labels(tmp_path / "labels.npy")
 
 
 def test_what_is_no_map_has_no_regions(image: xr.Dataset) -> None:

@@ -63,20 +63,15 @@ def test_a_wide_prior_leaves_a_map_as_it_is(maps: xr.Dataset) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "neighbor_sd", "what"),
+    ("name", "neighbor_sd", "answers", "what"),
     [
-        ("roughness", 0.1, "smooth: roughness: no such map"),
-        (NAME, 0.0, "neighbor_sd is 0.0; give a number above 0 in the unit of refractive_index"),
+        ("roughness", 0.1, 1, "smooth: roughness: no such map"),
+        (NAME, 0.0, 1, "neighbor_sd is 0.0; give a number above 0 in the unit of refractive_index"),
+        (NAME, NEIGHBOR, 0, "no pixel has an answer"),
     ],
 )
-def test_what_cannot_be_smoothed_is_refused(
-    maps: xr.Dataset, name: str, neighbor_sd: float, what: str
-) -> None:
+def test_what_cannot_be_smoothed_is_refused(maps, name, neighbor_sd, answers, what):
+    if not answers:
+        maps = maps.assign(status=0 * maps["status"] + Status.NOT_TRUSTED)
     with pytest.raises(pb.FitError, match=what):
         pb.maps.smooth(maps, name, neighbor_sd)
-
-
-def test_a_map_without_answers_is_refused(maps: xr.Dataset) -> None:
-    nothing = maps.assign(status=0 * maps["status"] + Status.NOT_TRUSTED)
-    with pytest.raises(pb.FitError, match="no pixel has an answer"):
-        pb.maps.smooth(nothing, NAME, NEIGHBOR)

@@ -14,11 +14,10 @@ import numpy as np
 import pytest
 from cases import each
 from plates import plate_capture
-from toy_models import capture, funnel, line, of_line
+from toy_models import capture, funnel, line, of_line, problem
 
 import polar_bayes as pb
-from polar_bayes.inference.problem import Problem, make_problem
-from polar_bayes.inference.request import resolve
+from polar_bayes.inference.problem import Problem
 from polar_bayes.methods.method import AbstractMethod, PosteriorDraws
 from polar_bayes.progress import no_progress
 from polar_bayes.scenes import fit_request as fitting
@@ -27,11 +26,8 @@ LINKS, KEY = {"q": pb.links.StokesLink()}, jax.random.key(0)
 
 
 @pytest.fixture(autouse=True)
-def compile_fast_rather_than_fast_code(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def few_prior_draws(compiled_in_haste: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fitting, "PRIOR_DRAWS", 20)
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,11 +111,6 @@ class Given(pb.methods.Auto):
     @override
     def candidates(self, problem: Problem):
         return dict(self.given)
-
-
-def problem(model) -> Problem:
-    request = resolve(capture(), model, "paper", None, LINKS, 90.0, 0, "double")
-    return make_problem(request, jax.random.key(0))
 
 
 def fitted(*rungs, **settings):

@@ -30,7 +30,7 @@ def coordinates_at(density, z: np.ndarray, covariance: np.ndarray, axes: np.ndar
         density=density,
         given=None,
         potential=NumpyPotential(gradient, None, z.dtype),
-        log_density_of=lambda x: -np.asarray(jax.vmap(lambda one: density(one, None))(x)),
+        log_density_of=lambda x: -np.asarray(jax.jit(jax.vmap(lambda one: density(one, None)))(x)),
         modes=modes,
         axes=axes,
         prior_sd=np.full(z.shape[1], 10.0),
@@ -40,8 +40,8 @@ def coordinates_at(density, z: np.ndarray, covariance: np.ndarray, axes: np.ndar
 def weighted(peak: Coordinates) -> tuple[np.ndarray, np.ndarray, float]:
     """Draws of the mixture (draw, 2), their weights, and how many these are worth."""
     mixture = profile_mixture(peak)
-    draws = np.asarray(draw_mixture(mixture, DRAWS, jax.random.key(0)))
-    proposed = np.asarray(log_density(mixture, jnp.asarray(draws)))
+    draws = jax.jit(draw_mixture, static_argnums=1)(mixture, DRAWS, jax.random.key(0))
+    proposed, draws = np.asarray(jax.jit(log_density)(mixture, draws)), np.asarray(draws)
     weights, _ = smooth((peak.log_density(draws) - proposed)[None])
     return draws, weights[0], float(weighted_ess(weights)[0])
 

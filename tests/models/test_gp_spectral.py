@@ -15,8 +15,9 @@ from arviz_stats.base import array_stats
 from cases import each
 from jax.flatten_util import ravel_pytree
 from numpyro import distributions as dist
+from plates import LINKS, PLATE
 from scipy import stats
-from spectral_plates import FRACTION, LINKS, PLATE, spectral_plate, tabulated
+from spectral_plates import FRACTION, spectral_plate, tabulated
 from textbook import mirror_and_body
 from tinygp import kernels
 
@@ -190,10 +191,7 @@ def test_the_posterior_is_that_of_another_density_and_another_sampler() -> None:
 
 # --- hard wavelengths -----------------------------------------------------------------------------
 
-HARD_COLORS = {
-    "two equal": np.array([550.0, 550.0]),
-    "two hundred": np.linspace(400.0, 800.0, 200),
-}
+HARD_COLORS = {"two equal": np.array([550.0, 550.0]), "two hundred": np.linspace(400.0, 800.0, 200)}
 
 
 @pytest.mark.thorough

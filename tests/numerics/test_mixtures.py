@@ -1,5 +1,7 @@
 """Mixtures of Student t distributions: their densities, and fits to weighted draws."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +20,15 @@ from polar_bayes.numerics.psis import smooth, weighted_ess
 FAR, WIDTH = 2.0, 0.02
 
 
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def fitted(z: jax.Array, components: int, count: int) -> tuple:
+    """A mixture of some components fitted to draws of equal weight, and draws of its own."""
+    weights = jnp.full(len(z), 1.0 / len(z))
+    mixture = fit_mixture(z, weights, components, jax.random.key(0))
+    drawn = draw_mixture(mixture, count, jax.random.key(1))
+    return mixture, drawn, log_density(mixture, drawn)
+
+
 def log_posterior(z: np.ndarray) -> np.ndarray:
     """Readings that know how far x is from 0, and not on which side; y is free."""
     return -0.5 * ((np.abs(z[:, 0]) - FAR) / WIDTH) ** 2 - 0.5 * z[:, 1] ** 2
@@ -27,11 +38,9 @@ def test_weighted_draws_of_a_fitted_mixture_are_the_posterior() -> None:
     random, count = np.random.default_rng(0), 4096
     z = random.normal([0.0, 0.0], [WIDTH, 1.0], (2048, 2))
     z[:, 0] += FAR * random.choice([-1.0, 1.0], 2048)
-    mixture = fit_mixture(jnp.asarray(z), jnp.full(2048, 1.0 / 2048), 4, jax.random.key(1))
-    drawn = draw_mixture(mixture, count, jax.random.key(2))
-    told = np.asarray(log_density(mixture, drawn))
+    _, drawn, told = fitted(z, 4, count)
     x, y = np.asarray(drawn).T
-    weights, pareto_k = smooth((log_posterior(np.asarray(drawn)) - told)[None])
+    weights, pareto_k = smooth((log_posterior(np.asarray(drawn)) - np.asarray(told))[None])
     assert pareto_k[0] < 0.7
     worth = weighted_ess(weights)[0]
     assert worth >= 400.0
@@ -44,15 +53,14 @@ def test_weighted_draws_of_a_fitted_mixture_are_the_posterior() -> None:
 def test_the_density_of_a_mixture_is_that_of_its_parts() -> None:
     random = np.random.default_rng(0)
     z = random.normal(size=(400, 2)) @ np.array([[1.0, 0.4], [0.0, 0.2]]) + np.array([3.0, -5.0])
-    mixture = fit_mixture(jnp.asarray(z), jnp.full(400, 1.0 / 400), 3, jax.random.key(0))
-    drawn = draw_mixture(mixture, 256, jax.random.key(1))
+    mixture, drawn, told = fitted(z, 3, 256)
     center, half = np.asarray(mixture.center), np.asarray(mixture.half)
     expected = np.zeros(256)
     for log_share, mean, scale in zip(*(np.asarray(x) for x in mixture[2:]), strict=True):
         root = half @ scale
         part = scipy.stats.multivariate_t(center + half @ mean, root @ root.T, DEGREES_OF_FREEDOM)
         expected += np.exp(log_share) * part.pdf(np.asarray(drawn))
-    difference = np.asarray(log_density(mixture, drawn)) - np.log(expected)
+    difference = np.asarray(told) - np.log(expected)
     assert np.exp(np.asarray(mixture.log_share)).sum() == pytest.approx(1.0)
     assert np.ptp(difference) < 1e-9  # up to a constant
 

@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 from cases import each
 
-from polar_bayes.numerics.psis import (
-    CHAINS,
-    FEWEST,
-    MOST,
-    max_effective_size,
-    systematic_resample,
-)
+from polar_bayes.numerics.psis import CHAINS, FEWEST, MOST, max_effective_size, systematic_resample
 
 
 def test_each_draw_is_chosen_as_often_as_it_weighs():

@@ -1,5 +1,7 @@
 """The way out of the body: through a plane, through facets, and the one as the other's limit."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,6 +30,8 @@ from polar_bayes.physics.surface import (
 )from polar_bayes.physics.variants import effects_of
 
 light_of = jax.jit(Scene.light, static_argnums=0)
+exit_of = jax.jit(RoughSurface.exit, static_argnums=0)
+entering_of = jax.jit(RoughSurface.entering, static_argnums=0)
 ZENITHS = jnp.array([0.0, 30.0, 60.0, 80.0])
 VIEWS = Geometry(ZENITHS, jnp.full(4, 20.0), ZENITHS, jnp.full(4, 200.0))
 MATERIAL = {"roughness": jnp.array([0.3]), "roughness_across": jnp.array([0.1])}
@@ -44,7 +48,7 @@ def test_a_rough_way_out_tends_to_the_plane(stack: Stack) -> None:
     gaps = []
     for roughness in (0.02, 0.01):
         smoother = {name: jnp.array([roughness]) for name in MATERIAL}
-        leaving = RoughSurface().exit(smoother, VIEWS, stack)
+        leaving = exit_of(RoughSurface(), smoother, VIEWS, stack)
         gaps.append(np.abs(leaving.q - plane.q)[1:])
     np.testing.assert_allclose(gaps[0], 4.0 * gaps[1], rtol=0.05)
     assert np.max(gaps[1]) < 3e-4
@@ -54,7 +58,7 @@ def test_grooves_polarize_even_towards_the_normal() -> None:
     """More than an isotropic surface can; the axis follows the grooves."""
     for turn, sign in ((20.0, 1.0), (110.0, -1.0)):
         surface = RoughSurface(slopes=AnisotropicSlopes(turn))
-        leaving = surface.exit({**MATERIAL, "roughness": jnp.array([0.5])}, VIEWS, BARE)
+        leaving = exit_of(surface, {**MATERIAL, "roughness": jnp.array([0.5])}, VIEWS, BARE)
         assert sign * leaving.q[0] < -3e-3
         np.testing.assert_allclose(leaving.u[0], 0.0, atol=1e-12)
 
@@ -62,7 +66,7 @@ def test_grooves_polarize_even_towards_the_normal() -> None:
 def test_a_scene_takes_its_way_out_from_the_surface() -> None:
     parameters = {"roughness": 0.4, "subsurface_fraction": 1.0, "refractive_index": 1.5}
     plane, smooth, rough = (
-        Scene(surface, Lambertian(), StokesMixing()).light(parameters, VIEWS)
+        light_of(Scene(surface, Lambertian(), StokesMixing()), parameters, VIEWS)
         for surface in (SmoothSurface(), RoughSurface(way_out=SmoothExit()), RoughSurface())
     )
     np.testing.assert_allclose(smooth.q, plane.q, rtol=1e-12, atol=1e-16)
@@ -108,17 +112,20 @@ def test_what_passes_facets_both_ways_gives_back_no_more_than_comes(light_zenith
         assert returned(SmoothExit(), light_zenith, roughness) <= 1.003 + rule
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def brightness_of(surface: RoughSurface, material: dict, geometry: Geometry) -> jax.Array:
+    interface = Interface(surface, Stack(material["refractive_index"]))
+    return WHITE.light(material, geometry, interface).intensity
+
+
 def swapped(way_out: AbstractExit, roughness: float, zenith: float, **parts: object) -> float:
     """Brightness lit from that zenith and seen from the normal, over that of the reverse."""
     there = Geometry(*(jnp.array([x]) for x in (0.0, 180.0, zenith, 0.0)))
     material = {"roughness": roughness, "roughness_across": 0.2, "refractive_index": 1.5}
     material = {name: jnp.array([value]) for name, value in material.items()}
-    interface = Interface(
-        RoughSurface(way_out=way_out, **parts), Stack(material["refractive_index"])
-    )
+    surface = RoughSurface(way_out=way_out, **parts)
     forth, back = (
-        WHITE.light(material, geometry, interface).intensity
-        for geometry in (there, there.reversed())
+        brightness_of(surface, material, geometry) for geometry in (there, there.reversed())
     )
     return float((forth / back)[0] / np.cos(np.deg2rad(zenith)))
 
@@ -152,7 +159,8 @@ def test_polarized_light_enters_through_facets_as_it_leaves() -> None:
     def entering(angle: float | None, way_out: AbstractExit, roughness: float) -> Light:
         light = None if angle is None else LinearPolarization(1.0, angle)
         surface = RoughSurface(illumination=PointSource(light), way_out=way_out)
-        return surface.entering(material | {"roughness": jnp.array([roughness])}, views, stack)
+        given = material | {"roughness": jnp.array([roughness])}
+        return entering_of(surface, given, views, stack)
 
     s, p, none = (entering(angle, RoughPassage(), 0.2).intensity for angle in (0.0, 90.0, None))
     np.testing.assert_allclose((s + p) / 2.0, none, rtol=1e-12)

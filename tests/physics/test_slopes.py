@@ -178,7 +178,7 @@ def test_facets_of_a_smooth_surface_sum_to_one(name: str, slopes: object) -> Non
     found = RoughSurface(DISTRIBUTIONS[name], UniformSky(), slopes=slopes)
     stack = Stack(jnp.array([1.5]))
     smooth = {key: jnp.asarray(value) for key, value in material(0.0, 0.0).items()}
-    light = found.light(smooth, geometry, stack)
+    light = jax.jit(found.light)(smooth, geometry, stack)
     cosine, square = jnp.cos(jnp.deg2rad(views)), jnp.sin(jnp.deg2rad(views)) ** 2
     bound = 2e-5 if name == "GGX" else 2e-4
     np.testing.assert_allclose(light.intensity, stack.reflection(cosine, square).mean, rtol=bound)

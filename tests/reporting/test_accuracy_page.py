@@ -7,18 +7,8 @@ from matplotlib.text import Text
 from synthetic_accuracy import ROWS, make_accuracy
 
 import polar_bayes as pb
-from polar_bayes.reporting.report import render
 
 pytestmark = pytest.mark.usefixtures("unpainted")
-
-
-@pytest.mark.thorough
-def test_the_report_lies_beside_its_file(tmp_path):
-    page = pb.report(make_accuracy(), tmp_path / "report")
-    again = pb.load(page.parent / "accuracy.nc")
-    assert page.read_text() == render(again)
-    with pytest.raises(pb.FitError, match="it goes with calibrations only"):
-        pb.report(make_accuracy(), tmp_path / "other", comparisons={})
 
 
 @pytest.mark.thorough

@@ -1,8 +1,9 @@
 """Every kind of report in a real browser, on a phone and on a screen, and on paper."""
 
 import csv
+import functools
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -56,15 +57,22 @@ def driver(tmp_path_factory: pytest.TempPathFactory) -> Iterator[webdriver.Chrom
 
 
 @pytest.fixture(scope="module")
-def reports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def reports(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """The page of each report, which is made when it is first asked for."""
     folder = tmp_path_factory.mktemp("reports")
-    return {name: pb.report(make(), folder / name) for name, make in REPORTS.items()}
+    return functools.cache(lambda name: pb.report(REPORTS[name](), folder / name))
 
 
+HARDEST = ("evil", "map", "accuracy")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [*HARDEST, *(pytest.param(x, marks=pytest.mark.thorough) for x in REPORTS if x not in HARDEST)],
+)
 @each("width", WIDTHS)
-@each("name", REPORTS)
 def test_a_report_opens_without_a_fault(driver, reports, name: str, width: int) -> None:
-    open_page(driver, reports[name], width)
+    open_page(driver, reports(name), width)
     assert faults(driver) == []
     assert driver.execute_script("return document.scripts.length") == 0
     assert driver.execute_script("return document.images.length") > 0
@@ -73,7 +81,7 @@ def test_a_report_opens_without_a_fault(driver, reports, name: str, width: int) 
 @pytest.mark.thorough
 @each("name", [name for name in REPORTS if name != "evil"])
 def test_the_verdict_is_on_the_first_screen_of_a_phone(driver, reports, name: str) -> None:
-    open_page(driver, reports[name], WIDTHS[0])
+    open_page(driver, reports(name), WIDTHS[0])
     place = driver.find_element(By.CSS_SELECTOR, "#verdict h2").rect["y"]
     assert place < 500
 
@@ -81,7 +89,7 @@ def test_the_verdict_is_on_the_first_screen_of_a_phone(driver, reports, name: st
 @pytest.mark.thorough
 @each("name", ["fit", "comparison"])
 def test_a_table_scrolls_in_its_own_box(driver, reports, name: str) -> None:
-    open_page(driver, reports[name], WIDTHS[0])
+    open_page(driver, reports(name), WIDTHS[0])
     boxes = driver.execute_script(
         "return [...document.querySelectorAll('table')].map(t => [t.parentElement.className,"
         " t.parentElement.getBoundingClientRect().right])"
@@ -95,7 +103,7 @@ def test_a_table_comes_down_as_a_file_without_network(driver, reports, tmp_path:
     driver.execute_cdp_cmd(
         "Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)}
     )
-    open_page(driver, reports["fit"], WIDTHS[1])
+    open_page(driver, reports("fit"), WIDTHS[1])
     driver.find_element(By.CSS_SELECTOR, "a[download='parameter.csv']").click()
     file = tmp_path / "parameter.csv"
     end = time.monotonic() + 20.0
@@ -111,7 +119,7 @@ def test_a_table_comes_down_as_a_file_without_network(driver, reports, tmp_path:
 @pytest.mark.thorough
 @each("name", ["fit", "comparison"])
 def test_a_report_can_be_printed(driver, reports, name: str) -> None:
-    open_page(driver, reports[name], WIDTHS[1])
+    open_page(driver, reports(name), WIDTHS[1])
     assert printed(driver).startswith(b"%PDF")
     driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
     size = {"width": 680, "height": 900, "deviceScaleFactor": 1, "mobile": False}

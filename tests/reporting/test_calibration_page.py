@@ -1,15 +1,11 @@
 """The page of a calibration: verdict first, failed fits counted, every figure explained."""
 
-import re
-from pathlib import Path
-
 import numpy as np
 import pytest
 import xarray as xr
 from cases import each
 from clipping import clipped
-from synthetic_calibrations import NAMES, make_calibration
-from synthetic_results import make_result
+from synthetic_calibrations import make_calibration
 
 import polar_bayes as pb
 from polar_bayes.calibration import verdict
@@ -31,38 +27,6 @@ def broken() -> xr.DataTree:
     """Roughness is told too narrowly, and the index too high."""
     wrong = {"narrow": {"roughness": 0.7}, "shifted": {"refractive_index": 0.4}}
     return make_calibration(**wrong, failed=FAILED, method="laplace")
-
-
-def test_the_folder_holds_page_and_calibration(tmp_path: Path, broken: xr.DataTree) -> None:
-    page = pb.report(broken, tmp_path / "report")
-    assert sorted(path.name for path in page.parent.iterdir()) == ["calibration.nc", "index.html"]
-    read = pb.load(page.parent / "calibration.nc")
-    assert render(read) == page.read_text()
-
-
-def test_arguments_that_do_not_apply_are_refused(tmp_path: Path, good: xr.DataTree) -> None:
-    fit = make_result(wavelengths=(), views=2, draws=10, variables=("dop",))
-    for asked, says in (
-        (
-            (fit, {"comparisons": {"laplace": good}}),
-            "comparisons: it goes with calibrations only",
-        ),
-        ((good, {"truth": xr.Dataset()}), "report: truth: it goes with maps only"),
-        (
-            (good, {"comparisons": {"laplace": fit}}),
-            "comparisons, laplace: it is no calibration",
-        ),
-        ((good, {"comparisons": {"importance": good}}), "give it another name"),
-        ((good, {"comparisons": {f"{at}": good for at in range(5)}}), "too many for one figure"),
-        (
-            (good, {"comparisons": {"other": make_calibration(names=NAMES[:1])}}),
-            "it has other parameters than importance",
-        ),
-    ):
-        with pytest.raises(pb.FitError, match=re.escape(says)) as error:
-            pb.report(asked[0], tmp_path / "report", **asked[1])
-        assert "\n" not in str(error.value)
-    assert not (tmp_path / "report").exists()
 
 
 # --- figures --------------------------------------------------------------------------------------
@@ -104,8 +68,7 @@ def test_dots_mark_where_the_curve_leaves_its_band(broken: xr.DataTree) -> None:
 
 
 @each(
-    "method",
-    {"laplace": "method='nuts'", "importance": "method='nuts'", "nuts": "longer"}.items(),
+    "method", {"laplace": "method='nuts'", "importance": "method='nuts'", "nuts": "longer"}.items()
 )
 def test_where_half_of_the_fits_fail_a_better_method_is_named(method) -> None:
     name, advice = method
@@ -119,9 +82,7 @@ def test_where_half_of_the_fits_fail_a_better_method_is_named(method) -> None:
     assert "Half of the fits" not in few
 
 
-def test_a_page_checks_its_calibration_once_and_computes_its_table_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_page_checks_its_calibration_once_and_computes_its_table_once(monkeypatch):
     tree, checked, rows = make_calibration(readings={"dop": 1.0}), [], []
     check, row = verdict.check_calibration, verdict._parameter_row
 

@@ -13,12 +13,7 @@ from synthetic_results import edit_provenance, make_result, replace
 from polar_bayes.diagnostics.view import view_of
 from polar_bayes.errors import FitError
 from polar_bayes.reporting import plots_fit
-from polar_bayes.reporting.plots_curves import (
-    curves,
-    minus_center,
-    plot_readings,
-    plot_residuals,
-)
+from polar_bayes.reporting.plots_curves import curves, minus_center, plot_readings, plot_residuals
 
 CASES = {
     "three wavelengths, four azimuths": {"azimuths": (180.0, 150.0, 120.0, 60.0)},
@@ -41,7 +36,15 @@ def result_of(case: str):
     return make_result(**{"draws": 50, "views": 10, **CASES[case]})
 
 
-@each("case", CASES)
+FIRST = (
+    "three wavelengths, four azimuths", "masked and set aside", "unusual names", "laplace",
+    "two views",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "case", [x if x in FIRST else pytest.param(x, marks=pytest.mark.thorough) for x in CASES]
+)
 def test_readings_of_every_layout(case: str) -> None:
     result = result_of(case)
     for draw, name in ((plot_readings, "dop"), (plot_residuals, "intensity")):

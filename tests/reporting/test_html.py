@@ -18,11 +18,10 @@ from polar_bayes.diagnostics.compare import compare_without
 from polar_bayes.diagnostics.convergence import Verdict, summary, verdict
 from polar_bayes.diagnostics.criticism import criticize
 from polar_bayes.diagnostics.view import FitView, view_of
-from polar_bayes.errors import FitError, PolarBayesError
+from polar_bayes.errors import PolarBayesError
 from polar_bayes.reporting import fit_page
 from polar_bayes.reporting.report import render, report
 from polar_bayes.reporting.text import interval, join, numbers, overconfidence, percent
-from polar_bayes.results import load
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -154,19 +153,6 @@ def test_the_first_screen_tells_the_index_the_trust_and_the_next_views(small) ->
     assert "the 95% intervals are expected to narrow by 0% to 75%." in Page(render(told)).text
 
 
-def test_the_folder_holds_page_and_result_and_nothing_else(tmp_path: Path) -> None:
-    result, folder = make_result(**SMALL), tmp_path / "deep" / "er"
-    folder.mkdir(parents=True)
-    report(make_result(**SMALL, seed=5), folder)  # an older report is replaced
-    assert report(result, folder) == folder / "index.html"
-    assert sorted(path.name for path in folder.iterdir()) == ["index.html", "result.nc"]
-    assert (folder / "index.html").read_text().startswith("<!DOCTYPE html>")
-    # What was written gives the same numbers and the same page, byte for byte.
-    read = load(folder / "result.nc")
-    pd.testing.assert_frame_equal(summary(read), summary(result))
-    assert render(read) == (folder / "index.html").read_text()
-
-
 @pytest.mark.thorough
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
@@ -175,13 +161,6 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
             report(make_result(**SMALL, method="point"), place)
         assert "\n" not in str(error.value)
         assert str(place) in str(error.value)
-
-
-@each("wrong", [None, xr.DataTree(), "fit.nc"])
-def test_what_is_no_result_leaves_no_folder(tmp_path: Path, wrong: object) -> None:
-    with pytest.raises(FitError, match="it holds no fit"):
-        report(wrong, tmp_path / "report")
-    assert not (tmp_path / "report").exists()
 
 
 def test_numbers_as_text() -> None:

@@ -6,11 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import xarray as xr
 from cases import each
 from reporting.test_pages import MEANS, mixed, truth
 from synthetic_maps import make_maps
-from synthetic_results import make_result
 
 import polar_bayes as pb
 from polar_bayes.reporting.maps import count_cases
@@ -69,23 +67,3 @@ def test_the_folder_holds_the_page(tmp_path: Path) -> None:
     page = pb.report(mixed(), tmp_path / "report", truth=truth())
     assert [path.name for path in (tmp_path / "report").iterdir()] == ["index.html"]
     assert page.read_text() == render(mixed(), truth=truth())
-
-
-def test_arguments_that_do_not_apply_are_refused(tmp_path: Path) -> None:
-    fit, maps = make_result(wavelengths=(), views=2, draws=10, variables=("dop",)), mixed()
-    for asked, says in (
-        ((fit, {"truth": truth()}), "report: truth: it goes with maps only"),
-        ((fit, {"uncorrected": maps}), "report: uncorrected: it goes with maps only"),
-        ((maps, {"uncorrected": maps}), "it is compared with the truth only; give truth="),
-        ((maps, {"truth": truth(), "uncorrected": maps}), "it was corrected as well"),
-        (
-            (maps, {"truth": truth(), "uncorrected": maps.isel(y=slice(3))}),
-            "it is of another image",
-        ),
-        ((maps, {"truth": xr.Dataset()}), "it knows the truth of no parameter"),
-        ((xr.Dataset(), {}), "it holds no fit"),
-    ):
-        with pytest.raises(pb.PolarBayesError, match=re.escape(says)) as error:
-            pb.report(asked[0], tmp_path / "report", **asked[1])
-        assert "\n" not in str(error.value)
-    assert not (tmp_path / "report").exists()

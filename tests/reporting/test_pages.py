@@ -8,6 +8,7 @@ states.
 """
 
 import difflib
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -221,6 +222,50 @@ def test_a_page_says_what_was_approved(name: str) -> None:
 @each("name", MORE)
 def test_a_page_of_a_rarer_result_says_what_was_approved(name: str) -> None:
     check_page(name, MORE[name])
+
+
+ASKED_OF_A_REPORT: dict[str, Callable[[], tuple]] = {
+    "comparisons: it goes with calibrations only": lambda: (
+        make_result(**SMALL), {"comparisons": {"laplace": calibrated()}}
+    ),
+    "it goes with calibrations only": lambda: (make_accuracy(), {"comparisons": {}}),
+    "report: truth: it goes with maps only": lambda: (calibrated(), {"truth": xr.Dataset()}),
+    "truth: it goes with maps only": lambda: (make_result(**SMALL), {"truth": truth()}),
+    "report: uncorrected: it goes with maps only": lambda: (
+        make_result(**SMALL), {"uncorrected": mixed()}
+    ),
+    "comparisons, laplace: it is no calibration": lambda: compared(laplace=make_result(**SMALL)),
+    "give it another name": lambda: compared(importance=calibrated()),
+    "too many for one figure": lambda: compared(**{f"c{at}": calibrated() for at in range(5)}),
+    "it has other parameters than importance": lambda: compared(other=calibrated(names=NAMES[:1])),
+    "it is compared with the truth only; give truth=": lambda: (mixed(), {"uncorrected": mixed()}),
+    "it was corrected as well": lambda: (mixed(), {"truth": truth(), "uncorrected": mixed()}),
+    "it is of another image": lambda: (
+        mixed(), {"truth": truth(), "uncorrected": mixed().isel(y=slice(3))}
+    ),
+    "it knows the truth of no parameter": lambda: (mixed(), {"truth": xr.Dataset()}),
+}  # fmt: skip
+"""Results and arguments that do not go together, by what is said of them."""
+
+
+def compared(**others: xr.DataTree) -> tuple[xr.DataTree, dict]:
+    return calibrated(), {"comparisons": others}
+
+
+@each("says", ASKED_OF_A_REPORT)
+def test_what_a_report_refuses_leaves_no_folder(says: str, tmp_path: Path) -> None:
+    result, arguments = ASKED_OF_A_REPORT[says]()
+    with pytest.raises(pb.PolarBayesError, match=re.escape(says)) as error:
+        pb.report(result, tmp_path / "report", **arguments)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "report").exists()
+
+
+@each("wrong", [None, xr.DataTree(), "fit.nc", xr.Dataset()])
+def test_what_is_no_result_leaves_no_folder(tmp_path: Path, wrong: object) -> None:
+    with pytest.raises(pb.FitError, match="it holds no fit"):
+        pb.report(wrong, tmp_path / "report")
+    assert not (tmp_path / "report").exists()
 
 
 def write_all() -> None:

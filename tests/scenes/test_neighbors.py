@@ -142,6 +142,7 @@ def test_a_body_that_may_absorb_is_told_with_the_answer_it_gives(absorbing_body)
     assert abs(told["other"] - truth) < 0.2 * abs(told["mean"] - truth)
 
 
+@pytest.mark.thorough
 def test_a_body_that_is_not_there_has_no_alternative() -> None:
     """Another body that sends nothing either is no better explanation, whatever its prior says."""
     fit = _fit("plastic", "camera", seed=14, parameters={"subsurface_fraction": 0.0})

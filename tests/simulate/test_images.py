@@ -2,7 +2,6 @@
 
 import doctest
 import re
-from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -33,12 +32,8 @@ FRACTION = np.linspace(0.6, 0.1, ROWS * COLUMNS).reshape(ROWS, COLUMNS)
 LIGHT = np.geomspace(0.05, 2.0, ROWS * COLUMNS).reshape(ROWS, COLUMNS)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def compiled_in_haste() -> Iterator[None]:
-    """Every shape of an array compiles operations of its own: that is what these tests cost."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
+# Every shape of an array compiles operations of its own: that is what these tests cost.
+pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 
 
 # --- dims and truth -------------------------------------------------------------------------------
