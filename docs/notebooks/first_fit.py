@@ -101,7 +101,7 @@ print(inside)
 # One capture in which the truth lies inside is no proof: a 95% interval may miss one in twenty
 # times, and an interval as wide as the prior nearly always holds. Whether intervals hold as often
 # as they say takes many simulated captures: see [calibration and the
-# paper](calibration_and_paper.md).
+# paper](calibration_and_paper.py).
 #
 # Nor are parameters told one by one. How they go together in the posterior:
 
@@ -128,5 +128,5 @@ print(page.name, f"{page.stat().st_size / 1e6:.1f} MB")
 #
 # The readings were drawn from the very scene and noise that were fitted. A wrong scene can fit
 # well, and give a narrow and wrong answer without any warning: [measured
-# plates](measured_plates.md) shows one. Next: [swap priors and links](priors_and_links.md), or read
+# plates](measured_plates.py) shows one. Next: [swap priors and links](priors_and_links.py), or read
 # what [each diagnostic](../inference.md) means.

@@ -155,4 +155,4 @@ print(said["fixed"], said["links"])
 # explain look like bad ones. Where several neighbors are off together, ask for an effect that the
 # scene is missing rather than for longer tails; [effects](../effects.md) lists the candidates.
 # Models of your own: [swapping](../swapping.md) and [extending](../extending.md). Next: [many
-# materials and colors](pooling_and_spectra.md).
+# materials and colors](pooling_and_spectra.py).
