@@ -1,14 +1,18 @@
-"""How Sphinx builds these pages: `sphinx-build -W -n docs site`; `-t online` links other projects."""
+"""How Sphinx builds these pages: `sphinx-build -W -n docs site`.
+
+With `-t online`, names of other projects are links to their documentation.
+"""
 
 import re
 import sys
 from importlib.metadata import version as version_of
 
-import polar_bayes
 from docutils import nodes
 from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 from sphinx.writers.html5 import HTML5Translator
+
+import polar_bayes
 
 project = "polar_bayes"
 author = "The polar_bayes authors"
@@ -21,10 +25,8 @@ extensions = [
     "sphinx.ext.intersphinx",
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
-    "sphinx_design",
-    "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["conf.py", "_templates", "examples/*", "gallery/*.py", "gallery/*.ipynb"]
+exclude_patterns = ["conf.py", "_templates"]
 
 # Pages: MyST Markdown. Notebooks: percent scripts, executed; what they say to stderr is a warning.
 myst_enable_extensions = ["colon_fence", "dollarmath"]
@@ -37,22 +39,12 @@ nb_execution_raise_on_error = True
 nb_output_stderr = "warn"
 nb_merge_streams = True
 
-# Gallery: each script of docs/examples, with its picture.
-sphinx_gallery_conf = {
-    "examples_dirs": "examples",
-    "gallery_dirs": "gallery",
-    "abort_on_example_error": True,
-    "filename_pattern": "",
-    "download_all_examples": False,
-    "write_computation_times": False,
-}
-
 # Reference: from docstrings, whose formulas and `names` are written as in Markdown. Namespaces that
 # are modules of another name are found by the name that users write.
 for namespace in ("input_quantities", "instrument", "links", "plots"):
     sys.modules[f"polar_bayes.{namespace}"] = getattr(polar_bayes, namespace)
 templates_path = ["_templates"]
-default_role = "code"
+default_role = "py:obj"
 autosummary_generate = True
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
@@ -60,9 +52,14 @@ autodoc_member_order = "bysource"
 napoleon_numpy_docstring = False
 napoleon_use_rtype = False
 
-# Every public name has to be found. Types that only signatures mention have no page, and those of
-# other projects are known where their inventories can be read.
-nitpick_ignore_regex = [("py:.*", r"(?!polar_bayes\.).*|polar_bayes\.\w+\.\w+\.\w+")]
+# A docstring that names a class or constant of ours which is not public is wrong. Modules and types
+# that only signatures mention have no page, and other projects' are known where online.
+nitpick_ignore = [("py:obj", f"polar_bayes.{name}") for name in ("PRIORS", "methods.STUDY_METHODS")]
+nitpick_ignore_regex = [
+    ("py:.*", r"(?!polar_bayes\.).*"),
+    ("py:.*", r"polar_bayes\.(\w+\.\w+|results|repr_html)\.\w+"),
+    ("py:obj", r"polar_bayes\.[a-z_]+\.[a-z_]+"),
+]
 intersphinx_mapping = (
     {
         "arviz": ("https://python.arviz.org/en/stable/", None),
@@ -72,7 +69,7 @@ intersphinx_mapping = (
         "python": ("https://docs.python.org/3/", None),
         "xarray": ("https://docs.xarray.dev/en/stable/", None),
     }
-    if tags.has("online")  # noqa: F821 - Sphinx defines it
+    if tags.has("online")  # Sphinx defines it
     else {}
 )
 
@@ -80,6 +77,7 @@ html_theme = "pydata_sphinx_theme"
 html_title = "polar_bayes"
 html_static_path = ["style.css"]
 html_css_files = ["style.css"]
+html_context = {"default_mode": "auto"}
 html_copy_source = False
 html_show_sourcelink = False
 html_math_renderer = "mathml"
