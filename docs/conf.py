@@ -3,6 +3,7 @@
 With `-t online`, names of other projects are links to their documentation.
 """
 
+import os
 import re
 import sys
 from importlib.metadata import version as version_of
@@ -29,15 +30,19 @@ extensions = [
 exclude_patterns = ["conf.py", "_templates"]
 
 # Pages: MyST Markdown. Notebooks: percent scripts, executed; what they say to stderr is a warning.
-myst_enable_extensions = ["colon_fence", "dollarmath"]
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 4
 nb_custom_formats = {".py": ["jupytext.reads", {"fmt": "py:percent"}]}
 nb_execution_mode = "cache"
+nb_execution_excludepatterns = (
+    [] if "POLAR_BAYES_DATA" in os.environ else ["measured_plates.py", "water_under_the_sky.py"]
+)
 nb_execution_in_temp = True
 nb_execution_timeout = 1200
 nb_execution_raise_on_error = True
 nb_output_stderr = "warn"
 nb_merge_streams = True
+suppress_warnings = ["myst-nb.lexer"]  # of a notebook that is not executed
 
 # Reference: from docstrings, whose formulas and `names` are written as in Markdown. Namespaces that
 # are modules of another name are found by the name that users write.

@@ -56,7 +56,7 @@ study = pb.accuracy(
 columns = ["error", "worst", "resolved", "ess", "gradients", "seconds_again"]
 pb.summary(study)[columns].round(3)
 
-# %%
+# %% mystnb={"image": {"alt": "Error of each method against its time"}}
 pb.plots.plot_accuracy(study)
 
 # %% [markdown]

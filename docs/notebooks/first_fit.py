@@ -28,7 +28,7 @@ capture = pb.simulate("plastic", scene=scene, protocol=protocol, seed=0)
 # the scene as it is (`pb.fit(capture)` does). 24 views stand on four azimuths at zeniths up to 85
 # degrees, and the light falls in at 45. Each view has a degree of polarization and a brightness.
 
-# %%
+# %% mystnb={"image": {"alt": "Degree of polarization against view zenith, by azimuth"}}
 for azimuth, part in capture.groupby("view_azimuth"):
     plt.plot(part["view_zenith"], part["dop"], "o-", label=f"azimuth {azimuth:.0f}")
 plt.xlabel("view zenith (degree)")
@@ -77,7 +77,7 @@ sensitivity(result)[["width_left", "verdict"]].round(2)
 #
 # Gray is the prior, and the cross is the truth, which no fit reads.
 
-# %%
+# %% mystnb={"image": {"alt": "Histograms of the posterior of each parameter"}}
 names = ("roughness", "subsurface_fraction", "absorption", "refractive_index")
 figure, axes = plt.subplots(2, 2, figsize=(8, 6), layout="constrained")
 for axis, name in zip(axes.flat, names, strict=True):

@@ -64,7 +64,7 @@ fitted = {"model": model, "scene": scene, "links": {"q": pb.links.StokesLink()}}
 maps = pb.fit_pixels(image, **fitted)
 print(pb.maps.count_pixels(maps))
 
-# %%
+# %% mystnb={"image": {"alt": "Maps of means, widths and status"}}
 pb.plots.plot_maps(maps)
 
 # %% [markdown]
