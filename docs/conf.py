@@ -30,7 +30,7 @@ extensions = [
 exclude_patterns = ["conf.py", "_templates"]
 
 # Pages: MyST Markdown. Notebooks: percent scripts, executed; what they say to stderr is a warning.
-myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 4
 nb_custom_formats = {".py": ["jupytext.reads", {"fmt": "py:percent"}]}
 nb_execution_mode = "cache"
