@@ -19,7 +19,7 @@ import polar_bayes as pb
 from polar_bayes.diagnostics.view import FitView, view_of
 from polar_bayes.reporting import text
 from polar_bayes.reporting.plots_curves import curves
-from polar_bayes.reporting.style import BLUE, GRAY, VERMILLION, lighten
+from polar_bayes.reporting.style import BLUE, VERMILLION, lighten
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"
 
@@ -29,7 +29,7 @@ INDEX = 1.52
 
 
 def fitted_plate() -> xr.DataTree:
-    """A fit by NUTS of s and p readings of glass, with a scale that is off by a third of a degree."""
+    """A fit by NUTS of s and p readings of glass; the angle scale is off by 0.3 degrees."""
     angle = np.arange(12.0, 79.0, 3.0)
     mirror = pb.Geometry.from_degrees(
         view_zenith=angle + 0.3, view_azimuth=180.0, light_zenith=angle + 0.3, light_azimuth=0.0
