@@ -59,7 +59,10 @@ napoleon_use_rtype = False
 
 # A docstring that names a class or constant of ours which is not public is wrong. Modules and types
 # that only signatures mention have no page, and other projects' are known where online.
-nitpick_ignore = [("py:obj", f"polar_bayes.{name}") for name in ("PRIORS", "methods.STUDY_METHODS")]
+nitpick_ignore = [
+    ("py:obj", f"polar_bayes.{name}")
+    for name in ("PRIORS", "methods.STUDY_METHODS", "priors.ANGLE_ZERO")
+]
 nitpick_ignore_regex = [
     ("py:.*", r"(?!polar_bayes\.).*"),
     ("py:.*", r"polar_bayes\.(\w+\.\w+|results|repr_html)\.\w+"),
