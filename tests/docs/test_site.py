@@ -47,8 +47,11 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def pages(site: Path) -> dict[Path, BeautifulSoup]:
-    found = [page for page in sorted(site.rglob("*.html")) if page.name not in MADE_BY_SPHINX]
-    return {page: BeautifulSoup(page.read_text(), "html.parser") for page in found}
+    return {
+        page: BeautifulSoup(page.read_text(), "html.parser")
+        for page in sorted(site.rglob("*.html"))
+        if page.name not in MADE_BY_SPHINX and "_static" not in page.parts
+    }
 
 
 def test_every_page_and_notebook_is_there(site: Path, pages: dict[Path, BeautifulSoup]) -> None:
