@@ -3,8 +3,7 @@
 #
 # Twelve pictures, each with the lines that make it. All captures are simulated, so the truth is
 # known, and the settings are small, so that a laptop draws each picture in less than a minute.
-# Nobody needs red and green to read them: the colors are those of Okabe and Ito, which color-blind
-# people can tell apart.
+# The colors are those of Okabe and Ito, which color-blind people can tell apart.
 #
 # The first capture is a plastic under a lamp, seen by a polarization camera from 40 directions.
 
@@ -22,9 +21,8 @@ plastic = pb.simulate("plastic", scene="camera", protocol=protocol, seed=1)
 # %% [markdown]
 # ## Readings and the bands of a fit
 #
-# Dots are readings. The inner band holds the prediction without noise, the outer one 95% of the
-# readings that the posterior predicts. Readings that lie outside
-# [speak against the model](criticism.md).
+# Half of new readings should fall in the dark band, and 95% in the light one. Readings that lie
+# outside [speak against the model](criticism.md).
 
 # %% mystnb={"image": {"alt": "Signed polarization against view zenith, with two bands of the fit"}}
 fit = pb.fit(plastic, method="importance", seed=0)
