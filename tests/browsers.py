@@ -10,7 +10,7 @@ import pytest
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 
-WIDTHS = (390, 1200)
+WIDTHS = (390, 1280)
 HEIGHT = 900
 PATIENCE = 600
 """On a machine that is busy with other tests, unit second."""

@@ -13,7 +13,6 @@ import inspect
 import re
 import shlex
 import tomllib
-import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -216,13 +215,9 @@ def test_the_paths_of_a_page_exist(page: Path) -> None:
 
 
 def anchors(page: Path) -> set[str]:
-    """What a heading is called in an address, as Python-Markdown has it."""
-    found = set()
-    for heading in re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE):
-        plain = unicodedata.normalize("NFKD", heading).encode("ascii", "ignore").decode()
-        plain = re.sub(r"[^\w\s-]", "", plain).strip().lower()
-        found.add(re.sub(r"[-\s]+", "-", plain))
-    return found
+    """What a heading is called in an address, as hosts of repositories and MyST have it."""
+    headings = re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE)
+    return {re.sub(r"[^\w\s-]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 @each("page", [README, ROOT / "CONTRIBUTING.md"], ids=lambda page: page.name)

@@ -24,9 +24,9 @@ class Geometry(NamedTuple):
     through the normal is smooth.
 
     Args:
-        view_zenith: Angle of the viewer from the normal. Shape (..., view), degree, |.| < 90.
+        view_zenith: Angle of the viewer from the normal. Shape (..., view), degree, `|angle| < 90`.
         view_azimuth: Azimuth of the viewer. Shape (..., view), degree.
-        light_zenith: Angle of the light from the normal. Shape (..., view), degree, |.| < 90.
+        light_zenith: Angle of the light from the normal. Shape (..., view), degree, `|angle| < 90`.
         light_azimuth: Azimuth of the light. Shape (..., view), degree.
         wavelength: Wavelength in air, nm, broadcasts with (..., view); None where it is not known.
         light_turn: Cosine and sine of twice the angle from the s axis in which polarized light is

@@ -69,7 +69,7 @@ class AbstractMicrofacet(Part):
             share: How far along the way to the limit. Broadcasts, 1, in (0, 1).
 
         Returns:
-            `(slope, weight)`: the mean over facets of f(|slope|) up to the limit is the
+            `(slope, weight)`: the mean over facets of `f(|slope|)` up to the limit is the
             integral of weight * f(slope) over share from 0 to 1.
         """
 

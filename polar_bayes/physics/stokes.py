@@ -125,7 +125,7 @@ class LinearPolarization(Part):
 
     Args:
         degree: Degree of linear polarization, 1, 0 to 1; a name fits it.
-        angle: Angle from the light's s axis, (z x l)/|z x l|, towards l x e_s, degree, -180 to
+        angle: Angle from the light's s axis, `(z x l)/|z x l|`, towards l x e_s, degree, -180 to
             180; a name fits it. 0 is perpendicular to the plane of normal and light.
 
     Raises:

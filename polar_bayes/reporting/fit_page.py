@@ -134,6 +134,7 @@ def fit_page(result: xr.DataTree | FitView) -> page.Page:
         problems=judged.problems,
         sentences=[*sentences, *text.notes(judged)],
         cautions=judged.cautions,
+        beside=_glance(fit),
         sections=sections,
         footer="Computed from result.nc, which lies in the same folder and holds every draw.",
     )
@@ -437,6 +438,13 @@ def budget_table(fit: FitView) -> Table:
 
 
 # --- Readings and checks --------------------------------------------------------------------------
+
+
+def _glance(fit: FitView) -> page.Picture:
+    """What stands beside the verdict: readings and the fit, small."""
+    quantity = QUANTITIES[plots_curves.variables(fit)[0]]
+    figure = plots_curves.readings_at_a_glance(fit)
+    return page.picture(figure, "fit.figure_glance", quantity=quantity)
 
 
 def _readings(fit: FitView) -> Iterator[page.Picture]:

@@ -162,6 +162,7 @@ class Page:
     problems: Sequence[str] = ()
     sentences: Sequence[str] = ()
     cautions: Sequence[str] = ()
+    beside: Picture | None = None
 
     @property
     def html(self) -> str:

@@ -128,6 +128,28 @@ def plot_readings(result: xr.DataTree | FitView, name: str) -> Figure:
 
 
 @style.styled
+def readings_at_a_glance(fit: FitView) -> Figure:
+    """The first variable of the first material and color, on the mirror side: one small panel."""
+    name = variables(fit)[0]
+    curve = curves(fit, name)[0]
+    azimuths = _azimuths([curve])
+    title = _azimuth_title(azimuths[0]) if azimuths else ""
+    chosen = np.ones(curve.sizes["view"], bool)
+    if azimuths:
+        chosen = np.round(curve["azimuth"].to_numpy()) == azimuths[0]
+    figure = style.NotebookFigure(figsize=(4.6, 3.3), layout="constrained")
+    axes = figure.subplots()
+    limit = float(fit.provenance.get("largest_view_zenith", 90.0))
+    drawn = _draw_curve(axes, _at(curve, chosen), limit)
+    shown = [style.label_text(part) for part in (curve.attrs["title"], title) if part]
+    axes.set(xlabel="view zenith [degree]", ylabel=SHORT[name], xlim=_zenith_limits([curve]))
+    axes.set_title(style.wrap(", ".join(shown), 44))
+    handles = [handle for key, handle in _reading_handles().items() if key in drawn]
+    style.add_legend(figure, handles, columns=2)
+    return figure
+
+
+@style.styled
 def plot_residuals(result: xr.DataTree | FitView, name: str) -> Figure:
     """The same after subtracting the fitted curve: where the model misses, and by how much.
 
@@ -159,11 +181,7 @@ def _draw_readings(fit: FitView, found: list[xr.Dataset], label: str, short_labe
     drawn: set[str] = set()
     for axes, curve in panels:
         drawn |= _draw_curve(axes, curve, limit)
-    zenith = np.concatenate([curve["zenith"] for curve in found])
-    zenith = zenith[np.isfinite(zenith)]
-    low, high = (float(zenith.min()), float(zenith.max())) if zenith.size else (0.0, 90.0)
-    margin = max(0.03 * (high - low), 1.0)
-    figure.axes[0].set_xlim(max(low - margin, -1.0), min(high + margin, 91.0))
+    figure.axes[0].set_xlim(*_zenith_limits(found))
     where = f", {_azimuth_title(azimuths[0])}" if len(azimuths) == 1 else ""
     # Not as a title: there the legend would cover it.
     part = f" (the first {len(shown)} of {len(found)})" if len(found) > len(shown) else ""
@@ -171,6 +189,14 @@ def _draw_readings(fit: FitView, found: list[xr.Dataset], label: str, short_labe
     handles = [handle for key, handle in _reading_handles().items() if key in drawn]
     style.add_legend(figure, handles, columns=4 if figure.get_figwidth() > 7.0 else 3)
     return figure
+
+
+def _zenith_limits(found: list[xr.Dataset]) -> tuple[float, float]:
+    zenith = np.concatenate([curve["zenith"] for curve in found])
+    zenith = zenith[np.isfinite(zenith)]
+    low, high = (float(zenith.min()), float(zenith.max())) if zenith.size else (0.0, 90.0)
+    margin = max(0.03 * (high - low), 1.0)
+    return max(low - margin, -1.0), min(high + margin, 91.0)
 
 
 type Panels = list[tuple[Axes, xr.Dataset]]

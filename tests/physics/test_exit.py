@@ -27,7 +27,8 @@ from polar_bayes.physics.surface import (
     RoughSurface,
     SmoothExit,
     SmoothSurface,
-)from polar_bayes.physics.variants import effects_of
+)
+from polar_bayes.physics.variants import effects_of
 
 light_of = jax.jit(Scene.light, static_argnums=0)
 exit_of = jax.jit(RoughSurface.exit, static_argnums=0)

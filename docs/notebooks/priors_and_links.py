@@ -65,7 +65,7 @@ fits = {
 columns = ["mean", "q2.5", "q97.5"]
 pd.concat({name: pb.summary(fit)[columns] for name, fit in fits.items()}).round(3)
 
-# %%
+# %% mystnb={"image": {"alt": "Readings of q and the bands of each fit"}}
 for name, fit in fits.items():
     predicted = fit["posterior_predictive"]["q"].quantile([0.025, 0.5, 0.975], ("chain", "draw"))
     low, middle, high = predicted.to_numpy()
@@ -155,4 +155,4 @@ print(said["fixed"], said["links"])
 # explain look like bad ones. Where several neighbors are off together, ask for an effect that the
 # scene is missing rather than for longer tails; [effects](../effects.md) lists the candidates.
 # Models of your own: [swapping](../swapping.md) and [extending](../extending.md). Next: [many
-# materials and colors](pooling_and_spectra.md).
+# materials and colors](pooling_and_spectra.py).

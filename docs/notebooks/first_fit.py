@@ -28,7 +28,7 @@ capture = pb.simulate("plastic", scene=scene, protocol=protocol, seed=0)
 # the scene as it is (`pb.fit(capture)` does). 24 views stand on four azimuths at zeniths up to 85
 # degrees, and the light falls in at 45. Each view has a degree of polarization and a brightness.
 
-# %%
+# %% mystnb={"image": {"alt": "Degree of polarization against view zenith, by azimuth"}}
 for azimuth, part in capture.groupby("view_azimuth"):
     plt.plot(part["view_zenith"], part["dop"], "o-", label=f"azimuth {azimuth:.0f}")
 plt.xlabel("view zenith (degree)")
@@ -77,7 +77,7 @@ sensitivity(result)[["width_left", "verdict"]].round(2)
 #
 # Gray is the prior, and the cross is the truth, which no fit reads.
 
-# %%
+# %% mystnb={"image": {"alt": "Histograms of the posterior of each parameter"}}
 names = ("roughness", "subsurface_fraction", "absorption", "refractive_index")
 figure, axes = plt.subplots(2, 2, figsize=(8, 6), layout="constrained")
 for axis, name in zip(axes.flat, names, strict=True):
@@ -101,7 +101,7 @@ print(inside)
 # One capture in which the truth lies inside is no proof: a 95% interval may miss one in twenty
 # times, and an interval as wide as the prior nearly always holds. Whether intervals hold as often
 # as they say takes many simulated captures: see [calibration and the
-# paper](calibration_and_paper.md).
+# paper](calibration_and_paper.py).
 #
 # Nor are parameters told one by one. How they go together in the posterior:
 
@@ -128,5 +128,5 @@ print(page.name, f"{page.stat().st_size / 1e6:.1f} MB")
 #
 # The readings were drawn from the very scene and noise that were fitted. A wrong scene can fit
 # well, and give a narrow and wrong answer without any warning: [measured
-# plates](measured_plates.md) shows one. Next: [swap priors and links](priors_and_links.md), or read
+# plates](measured_plates.py) shows one. Next: [swap priors and links](priors_and_links.py), or read
 # what [each diagnostic](../inference.md) means.

@@ -47,7 +47,7 @@ asked = {
 calibration = pb.calibrate(layout, **asked, seed=0)
 pb.summary(calibration).transpose()
 
-# %%
+# %% mystnb={"image": {"alt": "Ranks of the truth and coverage of the intervals"}}
 print(*pb.verdict(calibration).sentences, sep="\n")
 pb.plots.plot_calibration(calibration)
 

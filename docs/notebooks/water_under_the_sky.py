@@ -23,7 +23,7 @@ table = Path(os.environ["POLAR_BAYES_DATA"]) / "river_water" / "river_water_q.cs
 #
 # Viewer and light are on opposite sides, at the same zenith angle: the mirror geometry.
 
-# %%
+# %% mystnb={"image": {"alt": "Signed polarization of water against the angle"}}
 capture = pb.from_table(
     table,
     columns={"view_zenith": "aoi", "light_zenith": "aoi", "q_error": "err"},

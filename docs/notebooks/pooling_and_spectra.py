@@ -55,7 +55,7 @@ for name, fit in {"apart": apart, "pooled": pooled}.items():
     print(name, pb.verdict(fit).problems, pb.verdict(fit).cautions)
 pb.diagnostics.population_summary(pooled).round(3)
 
-# %%
+# %% mystnb={"image": {"alt": "Intervals of the index of eight plates, alone and pooled"}}
 colors = {"each alone": ("tab:gray", -0.12, apart), "pooled": ("tab:blue", 0.12, pooled)}
 rows = {}
 for name, (color, shift, fit) in colors.items():
@@ -102,7 +102,7 @@ alone = pb.fit(colored, method=pb.methods.Laplace(), **common)
 for name, fit in {"alone": alone, "coupled": coupled}.items():
     print(name, pb.verdict(fit).problems, pb.verdict(fit).cautions)
 
-# %%
+# %% mystnb={"image": {"alt": "Index against wavelength, alone and coupled"}}
 asked = np.linspace(400.0, 800.0, 41)
 bands = pb.inference.predict_spectrum(coupled, asked)["refractive_index"]
 low, middle, high = bands.quantile([0.025, 0.5, 0.975], ("chain", "draw")).to_numpy()

@@ -56,7 +56,7 @@ study = pb.accuracy(
 columns = ["error", "worst", "resolved", "ess", "gradients", "seconds_again"]
 pb.summary(study)[columns].round(3)
 
-# %%
+# %% mystnb={"image": {"alt": "Error of each method against its time"}}
 pb.plots.plot_accuracy(study)
 
 # %% [markdown]
@@ -99,4 +99,4 @@ pb.summary(result).round(3)
 # seconds are compilation, which a second fit of this layout does not pay.
 #
 # What no diagnostic here sees is a wrong scene: every method is measured against the posterior, not
-# against the truth. [Measured data](measured_plates.md) shows the difference.
+# against the truth. [Measured data](measured_plates.py) shows the difference.

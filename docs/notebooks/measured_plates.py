@@ -33,7 +33,7 @@ folder = Path(os.environ["POLAR_BAYES_DATA"])
 # 1910 in s and 1630 in p. The index of this glass is known from elsewhere: 1.509. The fit is not
 # told.
 
-# %%
+# %% mystnb={"image": {"alt": "Signed polarization of glass against the angle"}}
 print((folder / "glass_fresnel" / "s1.txt").read_text()[:40])
 capture = pb.from_goniometer(
     folder / "glass_fresnel" / "s1.txt",
@@ -134,7 +134,7 @@ for name, fit in fits.items():
 rows["prior"] = {"share at 1.38 or below": float((fit["prior"]["refractive_index"] <= 1.38).mean())}
 pd.DataFrame(rows).T.round(4)
 
-# %%
+# %% mystnb={"image": {"alt": "Signed polarization of PTFE and two fits"}}
 steep = ptfe["theta_i_deg"].to_numpy() == 75.0
 for name, fit in fits.items():
     predicted = fit["posterior_predictive"]["q"].quantile([0.025, 0.975], ("chain", "draw"))
@@ -157,7 +157,7 @@ plt.show()
 #
 # The same file says why one fraction for all views cannot be right. Its brightness was not fitted:
 
-# %%
+# %% mystnb={"image": {"alt": "Brightness of PTFE against the angle of reflection"}}
 plt.plot(turn[steep], ptfe["f_r11_per_sr"][steep], "o-")
 plt.xlabel("angle of reflection (degree), light at 75 degrees from the left")
 plt.ylabel("brightness (1/sr)")

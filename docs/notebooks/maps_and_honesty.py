@@ -64,7 +64,7 @@ fitted = {"model": model, "scene": scene, "links": {"q": pb.links.StokesLink()}}
 maps = pb.fit_pixels(image, **fitted)
 print(pb.maps.count_pixels(maps))
 
-# %%
+# %% mystnb={"image": {"alt": "Maps of means, widths and status"}}
 pb.plots.plot_maps(maps)
 
 # %% [markdown]
@@ -142,5 +142,5 @@ means.attrs["cautions"]
 # The interval is that of the map's own model, in which each pixel has a prior of its own. Where the
 # pixels of a region are alike, all those priors pull the same way. In the dark pixels of the shadow
 # they say more of the index than the readings do, and the caution says so: fit such a region as one
-# capture, or as [patches of one population](pooling_and_spectra.md). How maps are made, and how
+# capture, or as [patches of one population](pooling_and_spectra.py). How maps are made, and how
 # fast: [maps](../maps.md).

@@ -43,7 +43,7 @@ print(*pb.verdict(found).sentences, sep="\n")
 # The table is a linearization at one point. A profile moves one parameter, fits all others anew at
 # every value, and asks whether the readings object.
 
-# %%
+# %% mystnb={"image": {"alt": "Log profile likelihood of the refractive index"}}
 curve = pb.profile(capture, "refractive_index", scene=scene)
 print(*pb.verdict(curve).sentences, sep="\n")
 curve["profile"].sel(kind="likelihood").plot.line("o-", x="value")
