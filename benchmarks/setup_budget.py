@@ -18,6 +18,7 @@ import numpy as np
 from scipy import stats
 
 import polar_bayes as pb
+from polar_bayes.physics.scene import MATERIAL_PARAMETERS
 from polar_bayes.setups import SETUPS
 from polar_bayes.simulation import PRESETS, Protocol
 
@@ -48,7 +49,7 @@ def main() -> None:
             verdict = pb.verdict(fit)
             judged[name].append((bool(verdict.problems), bool(verdict.cautions)))
             tables.append(pb.summary(fit))
-        for name in (n for n in tables[0].index if f"true_{n}" in capture):
+        for name in (n for n in MATERIAL_PARAMETERS if n in tables[0].index):
             truth = float(capture[f"true_{name}"])
             ends = [table.loc[name, ["q2.5", "q97.5"]].to_numpy() for table in tables]
             widths = [np.ptp(each) for each in ends]
