@@ -25,7 +25,8 @@ from polar_bayes.physics.surface import (
     RoughSurface,
     SmoothExit,
     SmoothSurface,
-)from polar_bayes.physics.variants import effects_of
+)
+from polar_bayes.physics.variants import effects_of
 
 light_of = jax.jit(Scene.light, static_argnums=0)
 ZENITHS = jnp.array([0.0, 30.0, 60.0, 80.0])
