@@ -3,7 +3,7 @@
 #
 # A 95% interval should hold the truth 19 times in 20. That cannot be seen in one fit, and not in
 # real data, whose truth is unknown. It can be counted: draw parameters from the prior, simulate
-# captures, fit each, and look where the truth stands among the draws. Where model, prior and method
+# captures, fit each, and look where the truth lies among the draws. Where model, prior and method
 # are right, its rank is uniform.
 
 # %%
@@ -76,7 +76,7 @@ pb.summary(broken).transpose()
 # %% [markdown]
 # It noticed: the 95% intervals of the index hold about 82% of such truths, and the ranks say in
 # which direction the fit is off. Two things did not notice. The noise (`stokes_error_factor`) is
-# still well calibrated, because that part of the story was told right. And the readings pass their
+# still well calibrated, because that part of the model was right. And the readings pass their
 # own test: a fit that puts the index in the wrong place can still predict what will be read.
 #
 # ## One line of the paper's tables

@@ -70,7 +70,8 @@ sensitivity(result)[["width_left", "verdict"]].round(2)
 
 # %% [markdown]
 # `width_left` is the width of the 95% interval over that of the prior. Roughness and subsurface
-# fraction are told well. Of the absorption the prior is mostly left: its interval says what was
+# fraction are determined well. Of the absorption the prior is mostly left: its interval says
+# what was
 # believed before as much as what was measured, and should not be quoted as a measurement.
 #
 # ## The picture, and the truth
@@ -103,7 +104,7 @@ print(inside)
 # as they say takes many simulated captures: see [calibration and the
 # paper](calibration_and_paper.py).
 #
-# Nor are parameters told one by one. How they go together in the posterior:
+# Nor are parameters determined one by one. How they go together in the posterior:
 
 # %%
 result["posterior"].to_dataset().to_dataframe()[[*names, "exposure"]].corr().round(2)
@@ -116,8 +117,8 @@ result["posterior"].to_dataset().to_dataframe()[[*names, "exposure"]].corr().rou
 #
 # ## The report
 #
-# `pb.report(result, "report")` writes all of this and more as one page that stands alone, with the
-# result beside it as a netCDF file.
+# `pb.report(result, "report")` writes all of this and more as one page that needs no other file,
+# with the result next to it as a netCDF file.
 
 # %%
 page = pb.report(result, "report")

@@ -1,5 +1,5 @@
 # %% [markdown]
-# # Maps, and how honest they are
+# # Maps, and which pixels to trust
 #
 # A camera gives every pixel its own readings, so every pixel can have its own posterior. A map of
 # means looks well whatever it is worth. So a map here carries, for each pixel, how wide its
@@ -111,7 +111,7 @@ for name, region in regions.items():
 # Errors there are even smaller than announced (a ratio below 1), since the prior pulls doubtful
 # pixels to the middle, where these truths happen to be. Elsewhere errors are as large as announced.
 #
-# ## What goes wrong if the noise is told wrong
+# ## What goes wrong if the stated noise is wrong
 #
 # A map believes the noise that it is given. Told that readings are twice as good as they are:
 

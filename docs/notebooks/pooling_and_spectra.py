@@ -42,7 +42,7 @@ def read(index, error, seed, axis):
 # ## Plates of one batch
 #
 # Eight plates whose indices differ by about 0.02, six weak readings of each, with an error of 0.06.
-# One plate alone is told less well than the plates differ. Both fits are Laplace's, which takes
+# One plate alone is known less well than the plates differ. Both fits are Laplace's, which takes
 # seconds; quote NUTS.
 
 # %%
@@ -77,7 +77,7 @@ pd.DataFrame(rows).T.round(3)
 
 # %% [markdown]
 # Pooled intervals are a quarter narrower, and here they are nearer to the truth as well; both hold
-# it every time. The plates are drawn towards each other because all of them are told poorly, and
+# it every time. The plates are drawn towards each other because all of them are known poorly, and
 # only as far as the readings allow: the population is inferred, too. Its spread is not known well
 # (`spread_q2.5` to `spread_q97.5`); eight members say little about it, and its prior matters. Where
 # members differ by far more than their errors, pooling changes next to nothing.

@@ -3,7 +3,7 @@
 #
 # A posterior answers for three assumptions: the optics, what was believed before (the prior), and
 # how readings scatter (the link). Whoever doubts an answer should be able to replace one of them
-# and look what becomes of it. This takes a line each. Here the optics stay as they are; prior and
+# and look how it changes. This takes a line each. Here the optics stay as they are; prior and
 # link change.
 
 # %%
@@ -142,7 +142,7 @@ held = pb.fit(capture, model=known, **robust)
 pb.summary(held)[columns].round(3)
 
 # %% [markdown]
-# What was swapped is kept with the result, and its report shows it:
+# What was swapped is saved with the result, and its report shows it:
 
 # %%
 said = provenance_of(held)

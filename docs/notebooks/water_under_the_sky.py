@@ -2,7 +2,7 @@
 # # River water: from the wrong scene to the right one
 #
 # A fit always returns numbers. This notebook begins with the scene that nobody chose, and lets the
-# sentences of the package lead to another. The index of water is known, 1.34; no fit is told.
+# sentences of the package lead to another. The index of water is known, 1.34; no fit is given it.
 #
 # The measurements belong to others and are not part of this project. To run this notebook, set
 # `POLAR_BAYES_DATA` to a folder with `river_water/river_water_q.csv`: q of a river over the angle
