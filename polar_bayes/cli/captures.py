@@ -122,8 +122,9 @@ angle_option = option(
 SCALES = "incidence", "from-surface", "two-theta", "deviation"
 angle_is_option = option(
     "--angle-is", type=Name("scale of the angle", SCALES, CaptureError),
-    help=f"What the angles are: {', '.join(SCALES)} of the beam. Absolute values are taken, so "
-    "that a scan may pass zero. Without it: incidence, degrees from the surface normal, 0 or more.",
+    help="What the angles are: incidence; from-surface (90 degrees less it); two-theta (twice it); "
+    "deviation (of the beam, 180 less that). Signs do not count, so that a scan may pass zero. "
+    "Without it: incidence, degrees from the surface normal, 0 or more.",
 )  # fmt: skip
 sheet_option = option("--sheet", help="Sheet of an .xlsx workbook, where several hold something.")
 

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 from cases import each
+from numpyro import distributions as dist
 
 import polar_bayes as pb
 from polar_bayes.errors import CaptureError
@@ -174,3 +175,37 @@ def test_what_is_wrong_is_named(write, asked, said):
     with pytest.raises(CaptureError, match=re.escape(said)) as caught:
         pb.from_ellipsometer(table, **asked)
     assert str(caught.value).isprintable()
+
+
+@pytest.mark.thorough
+def test_a_thin_film_is_found_from_psi_and_delta(write):
+    """A film of index 1.8 and 120 nm on glass of 1.5, at three wavelengths; noise as assumed."""
+    waves, angle = np.array([450.0, 550.0, 650.0]), np.arange(40.0, 76.0, 3.0)
+    light = pb.physics.LinearPolarization(angle=-45.0)
+    optics = {"surface": pb.SmoothSurface(beam=pb.PointSource(light))}
+    lit = pb.Scene(**optics, coat=pb.ThinFilm(1.8, 120.0))
+    psi, delta = [], []
+    random = np.random.default_rng(6)
+    for wave in waves:
+        mirror = pb.Geometry.from_degrees(
+            view_zenith=angle, view_azimuth=180.0, light_zenith=angle, light_azimuth=0.0,
+            wavelength=wave,
+        )  # fmt: skip
+        said = lit.predict({"refractive_index": 1.5}, mirror)
+        q, u = (np.asarray(said[name], float) for name in ("q", "u"))
+        phase = np.arccos(np.clip(u / np.sqrt(1.0 - q**2), -1.0, 1.0))
+        psi.append(0.5 * np.rad2deg(np.arccos(q)) + 0.1 * random.normal(size=angle.size))
+        delta.append(np.rad2deg(phase) + 0.2 * random.normal(size=angle.size))
+    columns = np.tile(angle, 3), np.repeat(waves, angle.size), np.ravel(psi), np.ravel(delta)
+    capture = pb.from_ellipsometer(
+        write("a,w,P,D", *columns), angle="a", wavelength="w", psi="P", delta="D"
+    )
+    scene = pb.Scene(
+        pb.SmoothSurface(), coat=pb.ThinFilm("film_refractive_index", "film_thickness")
+    )
+    own = {"film_refractive_index": dist.Uniform(1.3, 2.0)}
+    table = pb.summary(pb.fit(capture, scene=scene, priors=own, method="laplace"))
+    for name, truth in (("film_refractive_index", 1.8), ("film_thickness", 120.0)):
+        row = table.loc[name]
+        assert abs(row["mean"] - truth) < 3.3 * row["sd"]
+    assert table.loc["film_thickness", "sd"] < 2.0
