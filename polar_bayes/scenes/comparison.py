@@ -389,13 +389,13 @@ def _select(fits: _Fits, library: SceneLibrary) -> None:
         best = better
 
 
-def _choose_layers(fits: _Fits, *, fringes: bool) -> tuple[set[str], list[str]]:
+def _choose_layers(fits: _Fits, *, fringes: bool) -> tuple[list[str], list[str]]:
     """Scenes that may remain, by whether they have a layer, and layers that are not decided.
 
     Systematic errors stand in for layers, so that layers are tried without them. A film makes the
     index that of the body below it, so that it has to be told apart from none.
     """
-    bare = set(fits.done)
+    bare = list(fits.done)
     clean = [name for name in bare if not fits.done[name].request.scene.has(Discrepancy)]
     if not clean:
         return bare, []
@@ -422,14 +422,14 @@ def _choose_layers(fits: _Fits, *, fringes: bool) -> tuple[set[str], list[str]]:
     found = max(layered, key=lambda name: fits.done[name].elpd, default=base)
     if is_apart(*gain(found, base)):
         near = [name for name in clean if name != base and not is_apart(*gain(base, name))]
-        others = fit_layers(near, found.removeprefix(f"{base} + "))
+        layered_base, others = found, fit_layers(near, found.removeprefix(f"{base} + "))
         found = max([found, *others], key=lambda name: fits.done[name].elpd)
         more, error = gain(found, best)
         if not is_apart(-more, error) and (more > 0.0 or not fits.done[found].unexplained):
-            return {found, *others}, []
+            return [layered_base, *others], []
     more, error = gain(found, base)
     if more > error and fits.done[found].elpd > fits.done[best].elpd:
-        return bare | {found}, []  # it predicts best, if not by much: both answers are stacked
+        return [*bare, found], []  # it predicts best, if not by much: both answers are stacked
     return bare, [name for name in layered if not is_apart(*gain(best, name))]
 
 
