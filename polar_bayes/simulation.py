@@ -51,7 +51,7 @@ class Material:
     Args:
         roughness: Microfacet roughness, unit 1.
         subsurface_fraction: Share of the subsurface, unit 1, range [0, 1].
-        absorption: Absorption relative to scattering at the reference wavelengths, unit 1.
+        absorption: Absorption over reduced scattering at the reference wavelengths, unit 1.
         refractive_index: At the reference wavelengths, unit 1.
     """
 

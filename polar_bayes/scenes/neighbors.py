@@ -30,7 +30,7 @@ from numpyro import distributions as dist
 
 from polar_bayes.diagnostics.alternatives import NOTHING
 from polar_bayes.diagnostics.criticism import INDEX_PARAMETERS
-from polar_bayes.errors import FitError
+from polar_bayes.errors import FitError, SceneError
 from polar_bayes.inference.initialization import HEAVY_MODE, JointInit
 from polar_bayes.inference.problem import Problem, compile_request, make_problem
 from polar_bayes.inference.program import Values
@@ -243,7 +243,7 @@ def compare_alternatives(
                 modes = find_modes(other, starts, progress, covariance)
                 factor = _log_evidence(other, modes) - evidence
                 at_mode = other.parameters(modes.z[0])
-        except FitError as error:
+        except (FitError, SceneError) as error:  # a model of the user's own may not read it
             rows.append(row | {"failed": str(error)})
             continue
         shift = {

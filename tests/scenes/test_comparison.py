@@ -178,16 +178,14 @@ def test_what_is_no_scene_is_refused(capture: xr.Dataset) -> None:
 def without_fits(monkeypatch: pytest.MonkeyPatch, gains: dict[str, float]) -> None:
     """In place of every fit, a gain for each part of its scene; the scenes in place of tables."""
 
-    def stand_in(fits: Any, name: str, request: Any) -> None:
+    def stand_in(name: str, requests: list, *_: Any) -> SimpleNamespace:
         total = sum(gain for part, gain in gains.items() if part in name)
         pointwise = total / 20 + 0.05 * (-1.0) ** np.arange(20) * len(name.split(" + "))
         view = SimpleNamespace(result={"posterior": xr.Dataset({"refractive_index": INDEX})})
-        fits.done[name] = SimpleNamespace(
-            elpd=total, pointwise=pointwise, unexplained=False, request=request, view=view
-        )
+        given = {"elpd": total, "pointwise": pointwise, "unexplained": False, "view": view}
+        return SimpleNamespace(**given, request=requests[0])
 
-    monkeypatch.setattr(selection, "_begin_to_compile", lambda _: None)
-    monkeypatch.setattr(selection._Fits, "_add", stand_in)
+    monkeypatch.setattr(selection, "_fitted", stand_in)
     monkeypatch.setattr(selection, "_comparison", lambda fits, *layers: [list(fits.done), *layers])
 
 
