@@ -99,7 +99,8 @@ class Scene(HTMLRepr):
         if plane and self.subsurface is not None and _has_film(self.coat):
             what = "facets under a thin film reflect what a plane under it lets out, up to 4% twice"
             hint = "give the surface way_out=RoughPassage(), which makes no light"
-            raise SceneError(what, where="way_out: SmoothExit() with ThinFilm", hint=hint)
+            where = "way_out: SmoothExit() with ThinFilm"
+            raise UnsuitablePartsError(what, where=where, hint=hint)
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -285,6 +286,10 @@ class Scene(HTMLRepr):
             raise SceneError(f"{', '.join(missing)} missing", where="parameters", hint=hint)
         dtype = jnp.result_type(geometry.dtype, *(parameters[name] for name in needed))
         return {name: jnp.asarray(parameters[name], dtype)[..., None] for name in needed}
+
+
+class UnsuitablePartsError(SceneError):
+    """Two parts do not go together, each of which goes with others."""
 
 
 def _has_film(coat: AbstractCoat | None) -> bool:

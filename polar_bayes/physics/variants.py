@@ -13,7 +13,7 @@ from typing import Any
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.coat import BackFace, ClearCoat, ThinFilm
 from polar_bayes.physics.part import Part
-from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.scene import Scene, UnsuitablePartsError
 from polar_bayes.physics.subsurface import Unpolarized
 from polar_bayes.physics.surface import SmoothSurface
 
@@ -61,8 +61,9 @@ def unseen_layers(scene: Scene, *, has_wavelength: bool) -> tuple[Effect, ...]:
         # Of a thick film the outer interface is all that polarization shows: only one whose index
         # is known can be told from a body.
         found.append(Effect("water film", ("coat",), None, WATER_FILM))
-        if has_wavelength:
-            found.append(Effect("thin film", ("coat",), None, ThinFilm()))
+        film = Effect("thin film", ("coat",), None, ThinFilm())
+        if has_wavelength and _applied(film, scene) is not None:
+            found.append(film)
     # The body of a transparent plate scatters nothing; stray light may take its place.
     surface, is_clear = scene.surface, isinstance(scene.subsurface, Unpolarized | None)
     if isinstance(surface, SmoothSurface) and surface.back is None and is_clear:
@@ -77,11 +78,8 @@ def _replacements(
     found: dict[Scene, tuple[KeyPath, Part, Part | None]] = {}
     for key_path, part in parts_of(scene):
         for replacement in offered(part):
-            try:
-                simpler = simplify(scene, [Effect("", key_path, part, replacement)])
-            except SceneError:  # the scene refuses this part beside its others
-                continue
-            if simpler != scene and len(key_path) >= len(found.get(simpler, ((),))[0]):
+            simpler = _applied(Effect("", key_path, part, replacement), scene)
+            if simpler not in (scene, None) and len(key_path) >= len(found.get(simpler, ((),))[0]):
                 found[simpler] = key_path, part, replacement
     short = [_name(part, replacement) for _, part, replacement in found.values()]
     return tuple(
@@ -93,6 +91,14 @@ def _replacements(
         )
         for name, (key_path, part, replacement) in zip(short, found.values(), strict=True)
     )
+
+
+def _applied(effect: Effect, scene: Scene) -> Scene | None:
+    """The scene without an effect; None where it would have parts that do not go together."""
+    try:
+        return effect.apply(scene)
+    except UnsuitablePartsError:
+        return None
 
 
 def simplify(scene: Scene, effects: Iterable[Effect]) -> Scene:

@@ -119,7 +119,16 @@ SIMPLER = [
     (SeparableShadowing(), ()),
     (RoughExit(), (SmoothExit(),)),
     (SmoothExit(), ()),
-    (TwoBounceSurface(GGX()), (RoughSurface(GGX(), quadrature=TwoBounceSurface().quadrature),)),
+    (
+        TwoBounceSurface(GGX()),
+        (
+            RoughSurface(
+                GGX(),
+                quadrature=TwoBounceSurface().quadrature,
+                shadowing=HeightCorrelatedShadowing(),
+            ),
+        ),
+    ),
 ]
 
 

@@ -85,7 +85,7 @@ ON = {
         PLAIN, subsurface=pb.Unpolarized(internal_reflection=pb.physics.InternalReflection())
     ),
     "clear coat": dataclasses.replace(PLAIN, coat=pb.ClearCoat()),
-    "thin film": dataclasses.replace(PLAIN, coat=pb.ThinFilm()),
+    "thin film": dataclasses.replace(rough(way_out=pb.physics.RoughPassage()), coat=pb.ThinFilm()),
     **{
         term.__name__: recorded(term())
         for term in (
