@@ -11,8 +11,8 @@ one cosine, its mean,
 
 $$ \mu_t = \frac{2}{3} [1 - (1 - \mu_c) \mu_c^2 / F_i], \qquad \mu_c^2 = 1 - 1/n^2 $$
 
-The absorption is $a = \mu_a/\mu_s'$ over *reduced* scattering $\mu_s' = (1 - g) \mu_s$, which diffuse
-light has in common whatever the anisotropy g (similarity).
+The absorption is $a = \mu_a/\mu_s'$ over *reduced* scattering $\mu_s' = (1 - g) \mu_s$, which
+diffuse light has in common whatever the anisotropy g (similarity).
 
 Source:
     Chandrasekhar 1960, Radiative transfer, sections 46 and 47.

@@ -44,6 +44,10 @@ from polar_bayes.repr_html import HTMLRepr, Row, Table
 MATERIAL_PARAMETERS = tuple(MATERIAL)
 
 
+class RefusedPairError(SceneError):
+    """Two parts that are right by themselves describe no surface together."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Scene(HTMLRepr):
     """Parts that are there act; parts that are None are absent from the compiled program.
@@ -98,7 +102,7 @@ class Scene(HTMLRepr):
         if plane and self.subsurface is not None and _has_film(self.coat):
             what = "facets under a thin film reflect what a plane under it lets out, up to 4% twice"
             hint = "give the surface way_out=RoughPassage(), which makes no light"
-            raise SceneError(what, where="way_out: SmoothExit() with ThinFilm", hint=hint)
+            raise RefusedPairError(what, where="way_out: SmoothExit() with ThinFilm", hint=hint)
 
     @property
     def parameters(self) -> tuple[str, ...]:

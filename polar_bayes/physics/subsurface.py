@@ -118,8 +118,8 @@ class Depolarizer(AbstractSubsurface):
 
     An absorbing body scatters light few times, so that more of its polarization is kept. R is that
     of the phase function (`polar_bayes.physics.phase_function`), for light that enters and leaves
-    as through a plane. The factor 1 - R_b is the paper's. A body that only depolarizes has none: its
-    light has the polarization of the way out at every albedo, as that of `Lambertian` and of
+    as through a plane. The factor 1 - R_b is the paper's. A body that only depolarizes has none:
+    its light has the polarization of the way out at every albedo, as that of `Lambertian` and of
     `TurbidMedium(polarized_fraction=0.0)` has.
 
     Args:

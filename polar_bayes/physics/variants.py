@@ -11,7 +11,7 @@ from typing import Any
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.part import Part
-from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.scene import RefusedPairError, Scene
 
 KeyPath = tuple[str | int, ...]
 """Keys from a scene to a part: names of fields, and indices of tuples."""
@@ -55,7 +55,7 @@ def _replacements(
         for replacement in offered(part):
             try:
                 simpler = simplify(scene, [Effect("", key_path, part, replacement)])
-            except SceneError:  # the scene refuses this part beside its others
+            except RefusedPairError:  # not beside the other parts
                 continue
             if simpler != scene and len(key_path) >= len(found.get(simpler, ((),))[0]):
                 found[simpler] = key_path, part, replacement

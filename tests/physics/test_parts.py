@@ -30,6 +30,7 @@ from polar_bayes.physics.microfacet import (
     AnisotropicSlopes,
     HeightCorrelatedShadowing,
     IsotropicSlopes,
+    NoShadowing,
     SeparableShadowing,
 )
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
@@ -119,7 +120,7 @@ SIMPLER = [
     (SeparableShadowing(), ()),
     (RoughExit(), (SmoothExit(),)),
     (SmoothExit(), ()),
-    (TwoBounceSurface(GGX()), (RoughSurface(GGX(), quadrature=TwoBounceSurface().quadrature),)),
+    (TwoBounceSurface(GGX()), (RoughSurface(GGX(), shadowing=HeightCorrelatedShadowing()),)),
 ]
 
 
@@ -163,6 +164,10 @@ REFUSED = [
     (lambda: Disc(91.0), "Disc: half_width=.* give degrees from 0.01 to 90"),
     (lambda: Disc(float("nan")), "Disc: half_width=.* give degrees from 0.01 to 90"),
     (lambda: TwoBounceSurface(illumination=Disc(5.0)), "has no second bounce; give PointSource"),
+    (
+        lambda: TwoBounceSurface(shadowing=NoShadowing()),
+        "no facet hides another.*RoughSurface",
+    ),
     (lambda: TwoBounceSurface(illumination=BEAM), "has no second bounce; give PointSource"),
     (lambda: Lambertian(-0.1), "albedo: -0.1 is neither a number from 0 to 1 nor a para"),
     (lambda: Unpolarized(1.5), "albedo: 1.5 is neither a number from 0 to 1 nor a para"),

@@ -71,7 +71,6 @@ def test_every_replacement_of_every_part_is_an_effect() -> None:
         "Disc -> PointSource": "surface.illumination",
         "FacetQuadrature -> FacetQuadrature(along=5, across=4)": "surface.quadrature",
         "AnisotropicSlopes -> IsotropicSlopes": "surface.slopes",
-        "RoughExit -> SmoothExit": "surface.way_out",
         "Lambertian -> Unpolarized": "subsurface",
         "InternalReflection": "subsurface.internal_reflection",
         "ThinFilm": "coat.coats[0]",
@@ -79,6 +78,12 @@ def test_every_replacement_of_every_part_is_an_effect() -> None:
         "AngleZero": "instrument.terms[0]",
         "DarkLevel": "instrument.terms[1]",
     }
+
+
+def test_a_pair_that_a_scene_refuses_is_no_effect() -> None:
+    bare = dataclasses.replace(ROUGH, coat=None)
+    assert "RoughExit -> SmoothExit" in named(bare)
+    assert "RoughExit -> SmoothExit" not in named(ROUGH)
 
 
 def test_each_changes_one_part_and_leaves_the_rest() -> None:
@@ -148,7 +153,7 @@ def test_a_replacement_that_does_not_fit_is_refused() -> None:
     [
         ("AngleZero", ["AngleZero"]),
         ("subsurface", ["Lambertian -> Unpolarized"]),
-        ("RoughExit", ["RoughExit -> SmoothExit"]),
+        ("surface.slopes", ["AnisotropicSlopes -> IsotropicSlopes"]),
         ("instrument.terms[1]", ["DarkLevel"]),
     ],
 )
