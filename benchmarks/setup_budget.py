@@ -6,7 +6,8 @@ Materials of one color are simulated in a set-up whose input quantities are off 
 from their priors, or in a perfect one. Every capture is fitted twice: as a set-up that is known
 perfectly, and with its input quantities. Prints for each parameter of the material how often the
 central 95% interval holds the truth, with Wilson's intervals, how wide the interval with the
-quantities is beside the other one (median), and how many verdicts are a problem or flagged.
+quantities is beside the other one (median), and how many verdicts are a problem or flagged. With
+`--calibrate`, truths are drawn from the priors instead (simulation-based calibration).
 """
 
 import argparse
@@ -29,7 +30,14 @@ def main() -> None:
     parser.add_argument("--captures", type=int, default=90)
     parser.add_argument("--method", default="importance")
     parser.add_argument("--perfect", action="store_true", help="The instrument has no error.")
+    parser.add_argument("--calibrate", action="store_true", help="Draw truths from the priors.")
     asked = parser.parse_args()
+    protocol = Protocol(views=24, wavelengths=())
+    if asked.calibrate:
+        layout = pb.simulate("leaf", scene=asked.scene, protocol=protocol, seed=0)
+        found = pb.calibrate(layout, method=asked.method, simulations=asked.captures, seed=0)
+        print(pb.summary(found).filter(like="held_95"), *pb.verdict(found).sentences, sep="\n")
+        return
     setup = SETUPS[asked.scene]
     known_perfectly = dataclasses.replace(setup, known=())
     real = dataclasses.replace(setup, scene=setup.scene.known_to(setup.known))
@@ -37,7 +45,6 @@ def main() -> None:
     judged: dict[str, list[tuple[bool, bool]]] = defaultdict(list)
     for seed in range(asked.captures):
         material = list(PRESETS)[seed % len(PRESETS)]
-        protocol = Protocol(views=24, wavelengths=())
         offsets = {} if asked.perfect else drawn(setup.known, seed)
         capture = pb.simulate(
             material, scene=real, parameters=offsets, protocol=protocol, seed=seed
