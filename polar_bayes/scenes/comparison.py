@@ -416,8 +416,8 @@ def _choose_layers(fits: _Fits, *, fringes: bool) -> tuple[list[str], list[str]]
     def gain(name: str, other: str) -> tuple[float, float]:
         return _gain(fits.done[name], fits.done[other])
 
-    indices = fits.done[base].view.result["posterior"].data_vars.get("refractive_index")
-    index = None if indices is None else indices.to_numpy()
+    posterior = fits.done[base].view.result["posterior"].data_vars
+    index = posterior["refractive_index"].to_numpy() if "refractive_index" in posterior else None
     layered = fit_layers([base])
     found = max(layered, key=lambda name: fits.done[name].elpd, default=base)
     if is_apart(*gain(found, base)):

@@ -125,6 +125,21 @@ def test_a_distribution_that_explains_the_readings_better_is_a_problem() -> None
     assert any("GGX" in problem for problem in pb.verdict(fit).problems)
 
 
+@pytest.mark.thorough
+def test_a_film_of_water_that_hides_the_index_is_named() -> None:
+    """The bare scene finds the index of the film, by ten sds, and every other check is content."""
+    fit = _fit("plastic", "camera", coat=pb.ClearCoat(1.333, 0.0))
+    row = criticize(fit).loc["alternatives"]
+    assert row["level"] == "caution"
+    assert "with a water film" in row["sentence"]
+    assert "the index is that of the outermost interface" in row["sentence"]
+    assert any("water film" in caution for caution in pb.verdict(fit).cautions)
+    water = alternatives(fit).set_index("alternative", append=True).xs("water film", level=1)
+    truth = float(fit["constant_data"]["true_refractive_index"])
+    n = water.loc["refractive_index"]
+    assert abs(n["other"] - truth) < 0.3 * abs(n["mean"] - truth)
+
+
 @pytest.fixture(scope="module")
 def absorbing_body() -> xr.DataTree:
     return _fit("leaf", "camera", subsurface=pb.physics.Depolarizer())
