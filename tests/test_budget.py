@@ -26,7 +26,7 @@ CODE = {
     "scenes": 1795,
     "own files": 1562,
     "models": 320,
-    "tests": 23324,
+    "tests": 23331,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
