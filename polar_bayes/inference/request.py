@@ -148,7 +148,7 @@ def resolve(
     chosen_by = "caller"
     if scene is None:
         chosen_by = "capture" if "setup" in capture.attrs else "default"
-        scene = str(capture.attrs.get("setup", "polarimeter"))
+        scene = str(capture.attrs.get("setup", "paper"))
     setup, scene_name = _find_scene(scene, capture)
     setup = as_read(setup, capture)
     if not is_perfect:
