@@ -166,8 +166,7 @@ def _of_one_channel(setup: Setup, capture: xr.Dataset) -> Setup:
     scene, angle = setup.scene, CHANNELS.get(str(capture["intensity"].attrs.get("channel")))
     scene = scene.without(ChannelGain) if scene.has(ChannelGain) else scene
     if angle is not None and not scene.has(Analyzer):
-        terms = scene.instrument.terms if scene.instrument else ()
-        scene = dataclasses.replace(scene, instrument=Instrument((*terms, Analyzer(angle))))
+        scene = dataclasses.replace(scene, instrument=Instrument((*scene.terms, Analyzer(angle))))
     stated = "intensity_error" in capture
     link = setup.links.get("intensity", StudentTLink(stated_errors=stated))
     return dataclasses.replace(setup, scene=scene, links={**setup.links, "intensity": link})
@@ -182,37 +181,39 @@ def setup_name(setup: Setup) -> str:
     )
 
 
-def default_priors(setup: Setup, capture: xr.Dataset) -> dict[str, dist.Distribution]:
-    """Priors of a set-up, and those that follow from how the capture says that it was made."""
+def default_priors(
+    setup: Setup, capture: xr.Dataset, known: Mapping[str, float] | None = None
+) -> dict[str, dist.Distribution]:
+    """Priors of a set-up, and those that follow from how the capture says that it was made.
+
+    The caller may say what the set-up is known to: standard uncertainties by input quantity.
+    """
     attrs = capture.attrs
     priors = {**setup.priors, "angle_zero": ANGLE_ZERO[attrs.get("angle_set_by", "hand")]}
     if attrs.get("incident_levels") == "not given":
         priors["channel_gain_ratio"] = UNCHECKED_GAIN
-    for term in setup.scene.instrument.terms if setup.scene.instrument else ():
+    for term in setup.scene.terms:
         if isinstance(term, Discrepancy):  # as many weights as it has basis functions
             priors["discrepancy_weights"] = dist.Normal(0.0, 1.0).expand([term.basis]).to_event(1)
-    return {name: prior for name, prior in priors.items() if name in setup.scene.parameters}
+    priors = {name: prior for name, prior in priors.items() if name in setup.scene.parameters}
+    return priors | _priors_known_to(known or {}, capture, setup, priors)
 
 
-def priors_known_to(
-    known: Mapping[str, float] | None, capture: xr.Dataset, usual: Mapping[str, dist.Distribution]
+def _priors_known_to(
+    known: Mapping[str, float],
+    capture: xr.Dataset,
+    setup: Setup,
+    own: Mapping[str, dist.Distribution],
 ) -> dict[str, dist.Distribution]:
-    """Priors of what a caller, or else a capture, says that the set-up is known to.
-
-    Args:
-        known: Standard uncertainties by input quantity, such as `{"light_zenith": 0.2}`.
-        capture: Its attributes `light_zenith_uncertainty` and so on state the same.
-        usual: The priors of the scene's parameters.
-
-    Raises:
-        FitError: There is no such quantity, or what is stated is no standard uncertainty.
-    """
+    """Priors of what a caller, or else an attribute of a capture, says that is known."""
+    every = {**PRIORS, **own}
+    usual = {name: every[name] for name in setup.scene.parameters if name in every}
     names = {name.removesuffix("_offset"): name for name in usual if _is_error(usual[name])}
     stated = {name: capture.attrs.get(f"{name}_uncertainty") for name in names}
-    stated = {name: u for name, u in stated.items() if u is not None} | dict(known or {})
+    stated = {name: u for name, u in stated.items() if u is not None} | dict(known)
     found = {}
     for name, u in stated.items():
-        where = f"known: {name}" if name in (known or {}) else f"capture: {name}_uncertainty"
+        where = f"known: {name}" if name in known else f"capture: {name}_uncertainty"
         if name not in names:
             hint = f"give some of {', '.join(names)}" if names else "a scene's terms state them"
             raise FitError("no input quantity of this scene", where=where, hint=hint)

@@ -13,14 +13,7 @@ import click
 from click.core import ParameterSource
 
 import polar_bayes as pb
-from polar_bayes.errors import (
-    CaptureError,
-    FitError,
-    OutputError,
-    PolarBayesError,
-    SceneError,
-    one_line,
-)
+from polar_bayes.errors import CaptureError, FitError, OutputError, PolarBayesError, SceneError
 from polar_bayes.methods.registry import method_names
 from polar_bayes.paths import as_path, check_output, is_scene_file, refuse_inputs
 
@@ -206,11 +199,14 @@ def _standard_uncertainties(
     ctx: Context, param: Param, value: tuple[tuple[str, str], ...]
 ) -> dict[str, float]:
     """NAME=NUMBER, given several times, as a mapping."""
-    try:
-        return {name: float(text) for name, text in value}
-    except ValueError as error:
-        hint = "write it as --known light_zenith=0.2"
-        raise FitError(f"{one_line(str(error))}", where="--known", hint=hint) from error
+    found = {}
+    for name, text in value:
+        try:
+            found[name] = float(text)
+        except ValueError as error:
+            where, hint = f"{_flag(param)} {name}={text}", "write it as --known light_zenith=0.2"
+            raise FitError("it is no number", where=where, hint=hint) from error
+    return found
 
 
 known_option = option(

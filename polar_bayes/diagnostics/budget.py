@@ -14,12 +14,14 @@ Source: JCGM 100:2008 (GUM), 5.1; Rodgers (2000), Inverse Methods for Atmospheri
 Kallioinen et al. (2024), Statistics and Computing 34, 57 (power scaling).
 """
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 import xarray as xr
+from jaxtyping import Float
 
 from polar_bayes.diagnostics.finding import join
 from polar_bayes.diagnostics.limits import LIMITS
@@ -62,14 +64,16 @@ def budget(
             where="budget: result",
             hint="fit with a set-up whose scene has input quantities, such as camera",
         )
-    errors = _errors(fit)
-    stated = pd.Series({name: fit.provenance["known"][each.name] for name, each in errors.items()})
+    errors, stated = _errors(fit), _stated(fit)
     asked = _asked(stated, known or {})
+    densities = _densities(fit, {each.name for each in errors.values()})
     rows = {}
     for scalar in fit.scalars:
         if scalar.is_material:
             with np.errstate(all="ignore"):  # draws of a damaged file may be huge
-                rows[scalar.label] = _row(fit, scalar, list(errors.values()), stated, asked)
+                joint = _covariance(scalar, errors)
+                noise = _share_of_noise(scalar, densities)
+                rows[scalar.label] = _row(joint, noise, stated, asked)
     columns = ["sd", "perfect", *OWN, *stated.index]
     table = PrintedFrame.from_dict(rows, orient="index", columns=columns)
     table.attrs["known"] = asked.to_dict()
@@ -88,24 +92,38 @@ def _errors(fit: FitView) -> dict[str, Scalar]:
     return {each.name.removesuffix("_offset"): each for each in usable}
 
 
+def _stated(fit: FitView) -> pd.Series:
+    """Their standard uncertainties, by name."""
+    return pd.Series({n: fit.provenance["known"][each.name] for n, each in _errors(fit).items()})
+
+
+def _covariance(scalar: Scalar, errors: Mapping[str, Scalar]) -> Float[np.ndarray, "n n"]:
+    """Of a parameter, first, and the input quantities."""
+    return np.cov(np.stack([each.draws.ravel() for each in (scalar, *errors.values())]))
+
+
 def _row(
-    fit: FitView, scalar: Scalar, errors: list[Scalar], stated: pd.Series, asked: pd.Series
+    joint: Float[np.ndarray, "n n"], noise: float, stated: pd.Series, asked: pd.Series
 ) -> list[float]:
     """One parameter: its sd, that of a perfect set-up, and what contributes to it."""
-    covariance = np.cov(np.stack([each.draws.ravel() for each in (scalar, *errors)]))
-    if not np.isfinite(covariance).all():
-        return [np.nan] * (4 + len(errors))
-    own, with_errors, of_errors = covariance[0, 0], covariance[0, 1:], covariance[1:, 1:]
-    explained = with_errors @ np.linalg.lstsq(of_errors, with_errors)[0]
+    if not np.isfinite(joint).all():
+        return [np.nan] * (4 + len(stated))
+    variance, with_errors = _known_otherwise(joint, stated, asked)
+    perfect = joint[0, 0] - joint[0, 1:] @ np.linalg.lstsq(joint[1:, 1:], joint[0, 1:])[0]
+    parts = with_errors / asked.to_numpy()
+    rest = variance - np.sum(parts**2)
+    variances = (variance, perfect, noise * rest, (1.0 - noise) * rest)
+    return [*np.sqrt(np.maximum(variances, 0.0)), *parts]
+
+
+def _known_otherwise(
+    joint: Float[np.ndarray, "n n"], stated: pd.Series, asked: pd.Series
+) -> tuple[float, Float[np.ndarray, " quantity"]]:
+    """Variance of a parameter, and covariances, where priors of quantities are as asked."""
     # Other standard uncertainties change the precision of each prior.
     change = np.diag(asked.to_numpy() ** -2.0 - stated.to_numpy() ** -2.0)
-    left = np.linalg.lstsq(np.eye(len(errors)) + of_errors @ change, with_errors)[0]
-    variance = own - with_errors @ change @ left
-    parts = left / asked.to_numpy()
-    rest = variance - np.sum(parts**2)
-    noise = _share_of_noise(fit, scalar, {each.name for each in errors})
-    variances = (variance, own - explained, noise * rest, (1.0 - noise) * rest)
-    return [*np.sqrt(np.maximum(variances, 0.0)), *parts]
+    left = np.linalg.lstsq(np.eye(len(stated)) + joint[1:, 1:] @ change, joint[0, 1:])[0]
+    return float(joint[0, 0] - joint[0, 1:] @ change @ left), left
 
 
 def variance_shares(table: pd.DataFrame) -> pd.DataFrame:
@@ -124,14 +142,19 @@ def _asked(stated: pd.Series, known: Mapping[str, float]) -> pd.Series:
     return pd.Series({**stated.to_dict(), **known}, dtype=float)
 
 
-def _share_of_noise(fit: FitView, scalar: Scalar, errors: set[str]) -> float:
+def _densities(fit: FitView, errors: set[str]) -> list[np.ndarray | None]:
+    """Log densities of the readings, and of all priors but those of the input quantities."""
+    likelihood = total_density(fit.result, "log_likelihood")
+    return [likelihood, total_density(fit.result, "log_prior", errors)]
+
+
+def _share_of_noise(scalar: Scalar, densities: list[np.ndarray | None]) -> float:
     """Of the variance that no input quantity explains, the share of noise; the rest is prior."""
     # Raising a density to a power a divides its part of the precision by a: the variance then
     # changes at the rate -Cov((x - mean)^2, log density), which is that part of a normal variance.
     square = (scalar.draws - scalar.draws.mean()) ** 2
     rates = []
-    for name, without in (("log_likelihood", set()), ("log_prior", errors)):
-        density = total_density(fit.result, name, without)
+    for density in densities:
         if density is None or not np.isfinite(density).all():
             return np.nan
         rates.append(max(-float(np.cov(square.ravel(), density.ravel())[0, 1]), 0.0))
@@ -149,16 +172,23 @@ class BetterKnown(NamedTuple):
 
 def better_known(fit: FitView, label: str) -> BetterKnown:
     """What to know better for the sake of a parameter."""
-    known = budget(fit).attrs["known"]
-    sds = {
-        name: float(budget(fit, known={name: 0.5 * u}).loc[label, "sd"])
-        for name, u in known.items()
+    errors, stated = _errors(fit), _stated(fit)
+    joint = _covariance(next(each for each in fit.scalars if each.label == label), errors)
+    half = 0.5 * stated
+    variances = {
+        name: _known_otherwise(joint, stated, stated.where(stated.index != name, half))[0]
+        for name in errors
     }
-    name = min(sds, key=sds.__getitem__)
-    half = 0.5 * known[name]
-    _, meaning, unit = notation(_errors(fit)[name].name)
-    of_unit = "" if unit == "1" else f" {unit}"
-    return BetterKnown(meaning, f"{known[name]:.2g}{of_unit}", f"{half:.2g}{of_unit}", sds[name])
+    name = min(variances, key=variances.__getitem__)
+    meaning, known = described(fit, name, stated[name])
+    _, better = described(fit, name, half[name])
+    return BetterKnown(meaning, known, better, math.sqrt(variances[name]))
+
+
+def described(fit: FitView, quantity: str, u: float) -> tuple[str, str]:
+    """What an input quantity means, and a standard uncertainty of it with its unit."""
+    _, meaning, unit = notation(_errors(fit)[quantity].name)
+    return meaning, f"{u:.2g}{'' if unit == '1' else f' {unit}'}"
 
 
 @once

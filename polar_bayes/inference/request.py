@@ -32,15 +32,7 @@ from polar_bayes.priors import (
     prior_text,
     resolve_priors,
 )
-from polar_bayes.setups import (
-    SETUPS,
-    Setup,
-    as_read,
-    default_priors,
-    find_setup,
-    priors_known_to,
-    setup_name,
-)
+from polar_bayes.setups import SETUPS, Setup, as_read, default_priors, find_setup, setup_name
 
 MODELS: dict[str, Callable] = {
     "per_material": per_material,
@@ -162,11 +154,7 @@ def resolve(
     stated = {} if priors is None else priors
     own: dict[str, dist.Distribution] = {}
     if isinstance(stated, Mapping):  # anything else is refused where the priors are read
-        usual = default_priors(setup, capture)
-        every = {**PRIORS, **usual}
-        usual |= priors_known_to(
-            known, capture, {n: every[n] for n in setup.scene.parameters if n in every}
-        )
+        usual = default_priors(setup, capture, known)
         same = {n: x for n, x in {**PRIORS, **usual}.items() if _are_same(stated.get(n), x)}
         own = {name: prior for name, prior in stated.items() if name not in same}
         stated = {**usual, **own, **same}

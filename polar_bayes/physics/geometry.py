@@ -78,6 +78,13 @@ class Geometry(NamedTuple):
         found = (view_zenith, view_azimuth, light_zenith, light_azimuth, wavelength)
         return cls(*(jax.device_put(found) if of is np else found))
 
+    def leaning(self, view: ArrayLike = 0.0, light: ArrayLike = 0.0) -> "Geometry":
+        """Zeniths larger by so many degrees, none beyond 89.999."""
+        return self._replace(
+            view_zenith=jnp.minimum(self.view_zenith + view, STEEPEST_ZENITH),
+            light_zenith=jnp.minimum(self.light_zenith + light, STEEPEST_ZENITH),
+        )
+
     def reversed(self) -> "Geometry":
         """Light and viewer in each other's place."""
         view, light = self[:2], self[2:4]

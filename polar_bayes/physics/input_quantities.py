@@ -16,8 +16,8 @@ from typing import ClassVar, override
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polar_bayes.physics.geometry import STEEPEST_ZENITH, Geometry, cos_degrees
-from polar_bayes.physics.instrument import AbstractInstrumentTerm, DarkLevel
+from polar_bayes.physics.geometry import Geometry, cos_degrees
+from polar_bayes.physics.instrument import AbstractInstrumentTerm, DarkLevel, DolpGain
 from polar_bayes.physics.part import Parameters, Part, at_least
 from polar_bayes.physics.stokes import Light, in_turned_frame
 
@@ -71,7 +71,7 @@ class LightZenith(AbstractInputQuantity):
 
     @override
     def aim(self, parameters: Parameters, geometry: Geometry) -> Geometry:
-        return _leaning(geometry, light=self.offset(parameters))
+        return geometry.leaning(light=self.offset(parameters))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,7 +93,7 @@ class ViewZenithScale(AbstractInputQuantity):
 
     @override
     def aim(self, parameters: Parameters, geometry: Geometry) -> Geometry:
-        return _leaning(geometry, view=self.offset(parameters) * geometry.view_zenith)
+        return geometry.leaning(view=self.offset(parameters) * geometry.view_zenith)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,7 +106,7 @@ class SampleLean(AbstractInputQuantity):
     def aim(self, parameters: Parameters, geometry: Geometry) -> Geometry:
         lean = self.offset(parameters)
         apart = cos_degrees(geometry.view_azimuth - geometry.light_azimuth)
-        return _leaning(geometry, view=apart * lean, light=lean)
+        return geometry.leaning(view=apart * lean, light=lean)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,8 +131,7 @@ class PolarizationGain(AbstractInputQuantity):
 
     @override
     def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
-        gain = 1.0 + self.offset(parameters)
-        return Light(light.intensity, gain * light.q, gain * light.u)
+        return DolpGain().record({"dolp_gain": 1.0 + self.offset(parameters)}, geometry, light)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,11 +165,3 @@ def _bent(contrast: Array, offset: Array) -> Array:
     """The contrast of two frames whose counts are a power 1 + offset of light."""
     inside = (1.0 - STRAY) * contrast
     return contrast + jnp.tanh((1.0 + offset) * jnp.arctanh(inside)) - inside
-
-
-def _leaning(geometry: Geometry, view: Array | float = 0.0, light: Array | float = 0.0) -> Geometry:
-    """Directions whose zeniths are larger by so many degrees, none beyond the horizon."""
-    return geometry._replace(
-        view_zenith=jnp.minimum(geometry.view_zenith + view, STEEPEST_ZENITH),
-        light_zenith=jnp.minimum(geometry.light_zenith + light, STEEPEST_ZENITH),
-    )

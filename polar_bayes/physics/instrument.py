@@ -148,11 +148,7 @@ class AngleZero(AbstractInstrumentTerm):
 
     @override
     def aim(self, parameters: Parameters, geometry: Geometry) -> Geometry:
-        shift = parameters["angle_zero"]
-        return geometry._replace(
-            view_zenith=jnp.minimum(geometry.view_zenith + shift, STEEPEST_ZENITH),
-            light_zenith=jnp.minimum(geometry.light_zenith + shift, STEEPEST_ZENITH),
-        )
+        return geometry.leaning(parameters["angle_zero"], parameters["angle_zero"])
 
 
 @dataclasses.dataclass(frozen=True)

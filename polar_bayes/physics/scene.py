@@ -113,6 +113,11 @@ class Scene(HTMLRepr):
         return (*material, *(name for name in read if name not in MATERIAL_PARAMETERS))
 
     @property
+    def terms(self) -> tuple[AbstractInstrumentTerm, ...]:
+        """Terms of the instrument; none of a perfect one."""
+        return () if self.instrument is None else self.instrument.terms
+
+    @property
     def optical_parameters(self) -> tuple[str, ...]:
         """Those of `parameters` that are not the instrument's."""
         instrument = () if self.instrument is None else self.instrument.parameters
@@ -190,9 +195,7 @@ class Scene(HTMLRepr):
         Returns:
             False too where there is no instrument.
         """
-        return self.instrument is not None and any(
-            isinstance(part, term) for part in self.instrument.terms
-        )
+        return any(isinstance(part, term) for part in self.terms)
 
     def without(self, term: type[AbstractInstrumentTerm]) -> "Scene":
         """The same scene with one instrument term removed.
@@ -206,10 +209,9 @@ class Scene(HTMLRepr):
         Raises:
             SceneError: The scene has no such term.
         """
-        terms = () if self.instrument is None else self.instrument.terms
-        rest = tuple(part for part in terms if not isinstance(part, term))
-        if len(rest) == len(terms):
-            present = ", ".join(type(part).__name__ for part in terms) or "none"
+        rest = tuple(part for part in self.terms if not isinstance(part, term))
+        if len(rest) == len(self.terms):
+            present = ", ".join(type(part).__name__ for part in self.terms) or "none"
             hint = f"name one of its instrument terms: {present}"
             raise SceneError(f"the scene has no {term.__name__}", where="without", hint=hint)
         return self._with_terms(rest)
@@ -223,16 +225,15 @@ class Scene(HTMLRepr):
         Returns:
             A new scene; the quantities follow the other terms of its instrument.
         """
-        terms = () if self.instrument is None else self.instrument.terms
-        own = {type(term) for term in terms}
-        terms = (*terms, *(each for each in quantities if type(each) not in own))
-        return self._with_terms(terms)
+        own = {type(term) for term in self.terms}
+        added = (each for each in quantities if type(each) not in own)
+        return self._with_terms((*self.terms, *added))
 
     @property
     def perfectly_known(self) -> "Scene":
         """The same scene without input quantities."""
-        terms = () if self.instrument is None else self.instrument.terms
-        return self._with_terms(tuple(x for x in terms if not isinstance(x, AbstractInputQuantity)))
+        others = (x for x in self.terms if not isinstance(x, AbstractInputQuantity))
+        return self._with_terms(tuple(others))
 
     def _with_terms(self, terms: tuple[AbstractInstrumentTerm, ...]) -> "Scene":
         return dataclasses.replace(self, instrument=Instrument(terms) if terms else None)
@@ -261,8 +262,7 @@ class Scene(HTMLRepr):
         return Light(*jnp.broadcast_arrays(*mixture))
 
     def _neutral_quantities(self) -> dict[str, float]:
-        terms = () if self.instrument is None else self.instrument.terms
-        known = (term for term in terms if isinstance(term, AbstractInputQuantity))
+        known = (term for term in self.terms if isinstance(term, AbstractInputQuantity))
         return {name: value for term in known for name, value in term.neutral.items()}
 
     def _wavelength(self, geometry: Geometry) -> Array:

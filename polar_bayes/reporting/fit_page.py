@@ -16,6 +16,7 @@ from polar_bayes.diagnostics.alternatives import alternatives
 from polar_bayes.diagnostics.budget import (
     budget,
     budget_sentences,
+    described,
     has_budget,
     variance_shares,
 )
@@ -32,7 +33,6 @@ from polar_bayes.inference.checks import CAUTION, PROBLEM
 from polar_bayes.inference.files import sentences_of_auto
 from polar_bayes.methods.registry import METHODS
 from polar_bayes.numerics.psis import MAX_PARETO_K
-from polar_bayes.physics.part import notation
 from polar_bayes.priors import short_numbers
 from polar_bayes.reporting import page, plots_curves, plots_fit, text
 from polar_bayes.reporting.accuracy import accuracy_picture, study_table
@@ -134,7 +134,7 @@ def fit_page(result: xr.DataTree | FitView) -> page.Page:
         problems=judged.problems,
         sentences=[*sentences, *text.notes(judged)],
         cautions=judged.cautions,
-        beside=_glance(fit),
+        beside=_glance(fit) if plots_curves.variables(fit) else None,
         sections=sections,
         footer="Computed from result.nc, which lies in the same folder and holds every draw.",
     )
@@ -422,9 +422,7 @@ def budget_table(fit: FitView) -> Table:
     descriptions = {"sd": "of the posterior", "perfect": "in a set-up that is known perfectly"}
     descriptions |= {"noise": "of the readings", "prior": "of the other parameters"}
     for quantity, u in found.attrs["known"].items():
-        offset = quantity if quantity in fit.provenance["known"] else f"{quantity}_offset"
-        _, meaning, unit = notation(offset)
-        descriptions[quantity] = f"{meaning}, ± {u:.2g}{'' if unit == '1' else f' {unit}'}"
+        descriptions[quantity] = ", ± ".join(described(fit, quantity, u))
 
     def cell(label: str) -> Callable[[pd.Series], str]:
         def of_row(row: pd.Series) -> str:

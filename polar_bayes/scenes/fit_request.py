@@ -209,9 +209,8 @@ def _prior_probability(request: Request, posterior: Values) -> dict[str, list[fl
 
 def _known(request: Request, problem: Problem) -> dict[str, float]:
     """Standard deviations of the priors of the instrument's parameters that are one number."""
-    instrument = request.scene.instrument
-    terms = () if instrument is None else instrument.terms
-    names = parameters_of(*(each for each in terms if not isinstance(each, Discrepancy)))
+    terms = (each for each in request.scene.terms if not isinstance(each, Discrepancy))
+    names = parameters_of(*terms)
     priors = {name: request.priors[name] for name in names if name in problem.program.supports}
     variances = {name: float(np.sum(prior.variance)) for name, prior in priors.items()}
     return {name: math.sqrt(x) for name, x in variances.items() if 0.0 < x < math.inf}

@@ -252,7 +252,7 @@ def _bodies(setup: Setup | None, shows_absorption: bool) -> Mapping[str, Any]:
 def _systematic_errors(setup: Setup | None) -> Instrument:
     """The instrument terms of the set-up, an unknown angle zero and gains, and a discrepancy."""
     # The discrepancy vanishes at normal incidence: what is the same at all angles is a gain.
-    given = setup.scene.instrument.terms if setup and setup.scene.instrument else ()
+    given = setup.scene.terms if setup else ()
     kinds = (AngleZero, ChannelGain, Discrepancy)
     others = (term for term in given if not isinstance(term, kinds))
     return Instrument((AngleZero(), ChannelGain(), *others, Discrepancy()))

@@ -73,12 +73,12 @@ STOPPED = "it was stopped before it was done"
 
 def removed_terms(request: Request) -> dict[str, list[AbstractInstrumentTerm]]:
     """By name of a comparison, the terms of the instrument without which it fits."""
-    instrument = request.scene.instrument
-    if instrument is None or not request.scene.has(Discrepancy):
+    terms = request.scene.terms
+    if not request.scene.has(Discrepancy):
         return {}
     return {
-        "without_discrepancy": [each for each in instrument.terms if isinstance(each, Discrepancy)],
-        "without_instrument": list(instrument.terms),
+        "without_discrepancy": [each for each in terms if isinstance(each, Discrepancy)],
+        "without_instrument": list(terms),
     }
 
 

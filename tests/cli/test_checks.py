@@ -8,6 +8,8 @@ import pytest
 import xarray as xr
 
 from polar_bayes.cli import main
+from polar_bayes.cli.captures import SCALES
+from polar_bayes.importers.mirror import ANGLE_IS
 
 
 def test_calibrate_prints_a_table_and_writes_every_fit(
@@ -76,3 +78,15 @@ def test_identify_follows_a_profile(plate: Path, capsys: pytest.CaptureFixture[s
     assert told["profile of subsurface_fraction: sentences"][0].startswith(
         "subsurface_fraction is "
     )
+
+
+def test_a_standard_uncertainty_that_is_no_number_is_named(
+    plate: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["budget", str(plate), "--known", "tone_curve=0.1", "--known", "lamp=far"]) == 1
+    said = capsys.readouterr().err
+    assert said == "--known lamp=far: it is no number; write it as --known light_zenith=0.2\n"
+
+
+def test_options_offer_every_scale_of_the_angle() -> None:
+    assert tuple(ANGLE_IS) == SCALES

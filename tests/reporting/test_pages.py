@@ -224,6 +224,13 @@ def test_a_page_of_a_rarer_result_says_what_was_approved(name: str) -> None:
     check_page(name, MORE[name])
 
 
+@each("group", ["noise_free", "posterior_predictive"])
+def test_a_fit_without_predictions_has_a_page(group: str, tmp_path: Path) -> None:
+    result = make_result(**SMALL)
+    del result[group]
+    assert "Parameters" in pb.report(result, tmp_path / "report").read_text()
+
+
 ASKED_OF_A_REPORT: dict[str, Callable[[], tuple]] = {
     "comparisons: it goes with calibrations only": lambda: (
         make_result(**SMALL), {"comparisons": {"laplace": calibrated()}}
