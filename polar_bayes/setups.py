@@ -218,7 +218,10 @@ def _priors_known_to(
             hint = f"give some of {', '.join(names)}" if names else "a scene's terms state them"
             raise FitError("no input quantity of this scene", where=where, hint=hint)
         check_uncertainty(u, where)
-        found[names[name]] = type(usual[names[name]])(scale=float(u))
+        kind = type(usual[names[name]])
+        # Of what only adds, the scale of the prior is not its standard deviation.
+        over_scale = math.sqrt(1.0 - 2.0 / math.pi) if issubclass(kind, dist.HalfNormal) else 1.0
+        found[names[name]] = kind(scale=float(u) / over_scale)
     return found
 
 

@@ -24,14 +24,14 @@ CODE = {
     "physics": 2642,
     "reporting": 3055,
     "scenes": 1794,
-    "own files": 1569,
+    "own files": 1571,
     "models": 320,
-    "tests": 23344,
+    "tests": 23350,
 }
 """By room, lines at most that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25264,
+    "code": 25266,
     "classes": 353,
     "constants": 449,
     "Any": 174,

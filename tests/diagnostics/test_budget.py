@@ -12,6 +12,7 @@ from polar_bayes.diagnostics.budget import better_known, budget_sentences, varia
 from polar_bayes.diagnostics.view import view_of
 from polar_bayes.inference.request import resolve
 from polar_bayes.physics.input_quantities import (
+    AmbientLight,
     AnalyzerRoll,
     PolarizationGain,
     SampleLean,
@@ -104,6 +105,14 @@ def test_a_capture_states_what_its_set_up_is_known_to(capture: xr.Dataset) -> No
     usual = {"view_zenith_scale": 0.005, "polarization_gain": 0.005}
     assert widths(None) == pytest.approx(usual | {"sample_lean": 0.05})
     assert widths({"sample_lean": 0.1}) == pytest.approx(usual | {"sample_lean": 0.1})
+
+
+def test_what_only_adds_is_known_to_its_standard_deviation(capture: xr.Dataset) -> None:
+    setup = Setup(PLATE, LINKS, known=(AmbientLight(),))
+    asked = ("per_material", setup, None, None, None, 0, "double")
+    prior = resolve(capture, *asked, known={"ambient_light": 0.01}).priors["ambient_light_offset"]
+    np.testing.assert_allclose(np.sqrt(prior.variance), 0.01, rtol=1e-6)  # single precision
+    assert type(prior) is type(pb.PRIORS["ambient_light_offset"])
 
 
 def test_what_to_know_better_stands_beside_further_views(fit: xr.DataTree) -> None:
