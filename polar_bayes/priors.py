@@ -558,13 +558,14 @@ _ROWS: dict[str, dist.Distribution] = {
     "discrepancy_amplitude": HalfNormal(0.12),
     "discrepancy_weights": dist.Normal(0.0, 1.0).expand([3]).to_event(1),
     # What a set-up is known to: a lamp placed by eye, the pose of a printed board, an analyzer set
-    # by its mark. Ambient light only adds.
+    # by its mark. Ambient light only adds, and an analyzer only loses polarization.
     "light_zenith_offset": dist.Normal(0.0, 1.0),
     "light_azimuth_offset": dist.Normal(0.0, 1.0),
     "view_zenith_scale_offset": dist.Normal(0.0, 0.005),
+    "incidence_angle_offset": dist.Normal(0.0, 0.75),
     "sample_lean_offset": dist.Normal(0.0, 0.2),
     "analyzer_roll_offset": dist.Normal(0.0, 0.3),
-    "polarization_gain_offset": dist.Normal(0.0, 0.005),
+    "polarization_loss_offset": HalfNormal(0.008),
     "ambient_light_offset": HalfNormal(0.005),
     "tone_curve_offset": dist.Normal(0.0, 0.01),
     # The noise: scales that the data themselves determine. None may reach zero: where the scene
@@ -584,8 +585,9 @@ PRIORS = Priors(_ROWS)
 ANGLE_ZERO: Mapping[str, dist.Distribution] = MappingProxyType(
     {"stage": dist.Normal(0.0, 0.2), "hand": PRIORS["angle_zero"], "lens": dist.Normal(0.0, 3.0)}
 )
-"""Prior of `angle_zero`, degree, by how the angles were set: by a rotary stage, by hand, or read
-from a picture through the geometry of its lens. What is not stated counts as by hand."""
+"""Prior of `angle_zero` and `incidence_angle_offset`, degree, by how the angles were set: by a
+rotary stage, by hand, or read from a picture through the geometry of its lens. What is not stated
+counts as by hand."""
 
 UNCHECKED_GAIN = dist.LogNormal(0.0, 0.3)
 """Prior of `channel_gain_ratio` where the incident levels of both channels were not read."""

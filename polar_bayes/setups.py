@@ -23,9 +23,10 @@ from polar_bayes.physics.input_quantities import (
     AbstractInputQuantity,
     AmbientLight,
     AnalyzerRoll,
+    IncidenceAngle,
     LightAzimuth,
     LightZenith,
-    PolarizationGain,
+    PolarizationLoss,
     ToneCurve,
     ViewZenithScale,
 )
@@ -87,7 +88,7 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
                 LightZenith(),
                 LightAzimuth(),
                 ViewZenithScale(),
-                PolarizationGain(),
+                PolarizationLoss(),
                 AmbientLight(),
                 ToneCurve(),
             ),
@@ -112,7 +113,7 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
             {"q": StokesLink(stated_errors=True), "u": StokesLink(stated_errors=True)},
             # A fraction of .009 dilutes the polarization of a mirror by a fifth already.
             priors=MAYBE_BARE,
-            known=(AnalyzerRoll(), PolarizationGain(), ToneCurve()),
+            known=(AnalyzerRoll(), PolarizationLoss(), ToneCurve()),
         ),
         # A laser beam grows longer than the sample towards grazing, each channel losing its own
         # share: beyond 78 degrees a plate's readings say more about its size than its index.
@@ -142,12 +143,34 @@ CHANNELS: Mapping[str, float] = MappingProxyType({"s": 0.0, "p": 90.0})
 
 
 def as_read(setup: Setup, capture: xr.Dataset) -> Setup:
-    """The set-up as a capture says that it was read: by one channel, or by polarized light."""
+    """The set-up as a capture was read: at mirror angles, by one channel, by polarized light."""
+    is_usual = any(setup.known == own.known for own in SETUPS.values())
+    if is_usual and is_mirrored(capture):
+        setup = _at_mirror_angles(setup)
     if "light_angle" in capture.get("u", xr.DataArray()).attrs:
         return _by_polarized_light(setup, float(capture["u"].attrs["light_angle"]))
     if {"dop", "q", "u"} & set(capture.data_vars) or "intensity" not in capture:
         return setup
     return _of_one_channel(setup, capture)
+
+
+def is_mirrored(capture: xr.Dataset) -> bool:
+    """Whether every view is in the mirror direction of the light."""
+    zenith = np.abs(capture["view_zenith"] - capture["light_zenith"])
+    around = np.abs((capture["view_azimuth"] - capture["light_azimuth"]) % 360.0 - 180.0)
+    sideways = around * np.sin(np.radians(capture["view_zenith"]))
+    degree = 0.5  # from the mirror direction of the light, at most
+    return bool((zenith <= degree).all() and (sideways <= degree).all())
+
+
+def _at_mirror_angles(setup: Setup) -> Setup:
+    """One angle sets lamp and viewer, so that they share its error."""
+    # Where no view leaves the highlight, readings do not tell a lamp's direction from a roughness.
+    directions = (LightZenith, LightAzimuth, ViewZenithScale)
+    others = tuple(each for each in setup.known if not isinstance(each, directions))
+    if len(others) == len(setup.known):
+        return setup
+    return dataclasses.replace(setup, known=(IncidenceAngle(), *others))
 
 
 def _by_polarized_light(setup: Setup, angle: float) -> Setup:
@@ -189,7 +212,8 @@ def default_priors(
     The caller may say what the set-up is known to: standard uncertainties by input quantity.
     """
     attrs = capture.attrs
-    priors = {**setup.priors, "angle_zero": ANGLE_ZERO[attrs.get("angle_set_by", "hand")]}
+    angle = ANGLE_ZERO[attrs.get("angle_set_by", "hand")]
+    priors = {**setup.priors, "angle_zero": angle, "incidence_angle_offset": angle}
     if attrs.get("incident_levels") == "not given":
         priors["channel_gain_ratio"] = UNCHECKED_GAIN
     for term in setup.scene.terms:

@@ -356,8 +356,9 @@ def simulate(
     recorded = {key: np.asarray(value) for key, value in found.items()}
     name = name or (preset if isinstance(preset, str) else "simulated")
     attributes: dict[str, str | int] = {"name": name, "seed": seed}
-    if (set_up := setup_name(setup)) != "custom" and not isinstance(scene, Scene):
-        attributes["setup"] = set_up  # a fit then takes the same set-up by default
+    set_up = "paper" if isinstance(scene, Scene) else setup_name(setup)
+    if set_up != "custom":  # a fit takes it by default; that of a scene alone has no error
+        attributes["setup"] = set_up
     return _label(recorded, protocol, IMAGE if image else (), truth, attributes)
 
 

@@ -1,5 +1,6 @@
 """The named set-ups hang together, and a wrong name is answered with the right ones."""
 
+import dataclasses
 import inspect
 
 import numpy as np
@@ -9,7 +10,7 @@ from cases import each
 import polar_bayes as pb
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.scene import SCENES, Scene
-from polar_bayes.setups import SETUPS, Setup, as_read, find_setup
+from polar_bayes.setups import SETUPS, Setup, as_read, default_priors, find_setup
 
 
 @each("name", SETUPS)
@@ -74,6 +75,26 @@ def test_a_set_up_is_taken_as_its_capture_was_read():
     lit = as_read(setup, turned)
     assert lit.scene.surface.beam.polarization.angle == -45.0
     assert lit.links["u"] == lit.links["q"]
+
+
+def test_lamp_and_viewer_of_mirror_views_share_the_error_of_one_angle():
+    """But for a set-up of the caller's own, which is taken as it is given."""
+    angles = np.arange(20.0, 80.0, 5.0)
+    capture = pb.from_goniometer((angles, 1.0 + angles), (angles, 90.0 - angles))
+    setup = SETUPS["polarimeter"]
+    found = as_read(setup, capture)
+    apart = {"light_zenith", "light_azimuth", "view_zenith_scale"}
+    names = {each.name for each in setup.known}
+    assert {each.name for each in found.known} == names - apart | {"incidence_angle"}
+    aside = capture.assign(view_azimuth=capture["view_azimuth"] + 30.0)
+    assert as_read(setup, aside) is setup
+    own = dataclasses.replace(setup, known=setup.known[:1])
+    assert as_read(own, capture) is own
+    prior = default_priors(
+        dataclasses.replace(found, scene=found.scene.known_to(found.known)),
+        capture.assign_attrs(angle_set_by="stage"),
+    )
+    assert prior["incidence_angle_offset"] is pb.priors.ANGLE_ZERO["stage"]
 
 
 @pytest.mark.thorough

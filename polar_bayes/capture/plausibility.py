@@ -183,7 +183,7 @@ def stated(capture: xr.Dataset) -> tuple[str, ...]:
         one on the incident levels of a goniometer.
     """
     setup = (
-        "Set-up: not stated, so a fit takes 'paper', a point source and an unsigned degree "
+        "Set-up: not stated, so a fit takes 'polarimeter', a point source and an unsigned degree "
         "of polarization; name it by setup= at import or scene= of the fit."
     )
     if "setup" in capture.attrs:

@@ -81,7 +81,7 @@ def from_table(
         aolp_from: The axis from which `aolp` counts: "s" (perpendicular to the plane of normal and
             viewer) or "p" (in that plane).
         sheet: Sheet of a workbook, where several hold something.
-        setup: Which scene, links and limits a fit takes by default; None: the paper's.
+        setup: Which scene, links and limits a fit takes by default; None: those of "polarimeter".
         angle_set_by: How the angles were set: "stage", "hand" or "lens"; a fit takes the prior of
             `angle_zero` from it (`polar_bayes.priors.ANGLE_ZERO`).
         saturation_level: Intensity, > 0, at which the detector saturates.

@@ -140,7 +140,7 @@ def resolve(
     chosen_by = "caller"
     if scene is None:
         chosen_by = "capture" if "setup" in capture.attrs else "default"
-        scene = str(capture.attrs.get("setup", "paper"))
+        scene = str(capture.attrs.get("setup", "polarimeter"))
     setup, scene_name = _find_scene(scene, capture)
     setup = as_read(setup, capture)
     if not is_perfect:
@@ -266,7 +266,7 @@ def _setup_around(scene: object, capture: xr.Dataset) -> Setup:
             where="scene",
             hint=f"give a polar_bayes.Scene, a Setup, or one of {', '.join(SETUPS)}",
         )
-    base = SETUPS.get(str(capture.attrs.get("setup")), SETUPS["paper"])
+    base = SETUPS.get(str(capture.attrs.get("setup")), SETUPS["polarimeter"])
     return dataclasses.replace(base, scene=scene)
 
 

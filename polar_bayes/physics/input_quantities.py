@@ -24,9 +24,10 @@ from polar_bayes.physics.stokes import Light, in_turned_frame
 __all__ = [
     "AmbientLight",
     "AnalyzerRoll",
+    "IncidenceAngle",
     "LightAzimuth",
     "LightZenith",
-    "PolarizationGain",
+    "PolarizationLoss",
     "SampleLean",
     "ToneCurve",
     "ViewZenithScale",
@@ -97,6 +98,17 @@ class ViewZenithScale(AbstractInputQuantity):
 
 
 @dataclasses.dataclass(frozen=True)
+class IncidenceAngle(AbstractInputQuantity):
+    """Light and viewer, set by one angle, are further from the normal by some degrees."""
+
+    name = "incidence_angle"
+
+    @override
+    def aim(self, parameters: Parameters, geometry: Geometry) -> Geometry:
+        return geometry.leaning(self.offset(parameters), self.offset(parameters))
+
+
+@dataclasses.dataclass(frozen=True)
 class SampleLean(AbstractInputQuantity):
     """The normal of the sample leans away from the light, in its plane; unit degree."""
 
@@ -124,14 +136,14 @@ class AnalyzerRoll(AbstractInputQuantity):
 
 
 @dataclasses.dataclass(frozen=True)
-class PolarizationGain(AbstractInputQuantity):
-    """Polarizations are read too large by a share: an analyzer's extinction, a calibration."""
+class PolarizationLoss(AbstractInputQuantity):
+    """Readings lose a share of polarization: an analyzer's extinction, cross-talk of pixels."""
 
-    name = "polarization_gain"
+    name = "polarization_loss"
 
     @override
     def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
-        return DolpGain().record({"dolp_gain": 1.0 + self.offset(parameters)}, geometry, light)
+        return DolpGain().record({"dolp_gain": 1.0 - self.offset(parameters)}, geometry, light)
 
 
 @dataclasses.dataclass(frozen=True)

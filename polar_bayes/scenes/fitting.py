@@ -50,7 +50,7 @@ def fit(
             ends; what is not done by then is abandoned, and the best answer so far is returned.
             Also of scene="auto", with any method: of the comparison of scenes.
         scene: A name in `SETUPS` or a `Scene`; by default the set-up that the capture names in
-            its attribute `setup`, else "paper". "auto" compares scenes, as
+            its attribute `setup`, else "polarimeter". "auto" compares scenes, as
             `polar_bayes.compare_scenes` does, and stacks the posteriors of those that remain.
             With the default method, weighted draws of the comparison that pass the rules of
             convergence serve as they are; the other scenes are sampled.

@@ -12,7 +12,6 @@ from collections.abc import Collection, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
 import xarray as xr
 
 from polar_bayes.observation.links import AbstractLink, BetaLink, StokesLink, StudentTLink
@@ -29,7 +28,7 @@ from polar_bayes.physics.mixing import AbstractMixing, StokesMixing
 from polar_bayes.physics.scene import WAY_OUT, Scene
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian, Unpolarized
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
-from polar_bayes.setups import SETUPS, Setup
+from polar_bayes.setups import SETUPS, Setup, is_mirrored
 
 Choice = tuple[str, ...]
 """The option of each slot, by name; "" where the slot stays empty."""
@@ -222,15 +221,6 @@ def default_links(capture: xr.Dataset) -> Mapping[str, AbstractLink] | None:
     if links and "intensity" in capture:
         links["intensity"] = StudentTLink()
     return links or None
-
-
-def is_mirrored(capture: xr.Dataset) -> bool:
-    """Whether every view is in the mirror direction of the light."""
-    zenith = np.abs(capture["view_zenith"] - capture["light_zenith"])
-    around = np.abs((capture["view_azimuth"] - capture["light_azimuth"]) % 360.0 - 180.0)
-    sideways = around * np.sin(np.radians(capture["view_zenith"]))
-    degree = 0.5  # from the mirror direction of the light, at most
-    return bool((zenith <= degree).all() and (sideways <= degree).all())
 
 
 def has_beam(capture: xr.Dataset) -> bool:

@@ -299,7 +299,7 @@ def test_a_peak_that_light_of_a_body_may_have_moved_is_beyond_no_prior():
 
 def test_set_up_and_incident_levels_are_told():
     capture = validate(plate())
-    assert stated(capture)[0].startswith("Set-up: not stated, so a fit takes 'paper'")
+    assert stated(capture)[0].startswith("Set-up: not stated, so a fit takes 'polarimeter'")
     capture = capture.assign_attrs(setup="goniometer", incident_levels="not given")
     setup, levels = stated(capture)
     assert setup == "Set-up: goniometer, which its fits take by default."

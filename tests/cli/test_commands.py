@@ -107,7 +107,7 @@ def test_a_fit_says_what_it_chose_and_what_is_unlikely(
     words += ["--column", "light_zenith", "angle", "--constant", "view_azimuth", "180"]
     assert main([*words, "--constant", "light_azimuth", "0", "--out", str(capture)]) == 0
     told = capsys.readouterr()
-    assert "Set-up: not stated, so a fit takes 'paper'" in told.out
+    assert "Set-up: not stated, so a fit takes 'polarimeter'" in told.out
     assert "caution: q is negative at 4 of 5 mirror angles" in told.err
     words = ["fit", str(capture), "--scene", "picture", "--largest-view-zenith", "70"]
     main([*words, "--method", "point", "--json", "--out", out])

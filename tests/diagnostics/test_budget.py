@@ -14,7 +14,6 @@ from polar_bayes.inference.request import resolve
 from polar_bayes.physics.input_quantities import (
     AmbientLight,
     AnalyzerRoll,
-    PolarizationGain,
     SampleLean,
     ToneCurve,
     ViewZenithScale,
@@ -22,8 +21,8 @@ from polar_bayes.physics.input_quantities import (
 from polar_bayes.reporting.text import setup_beside_views
 from polar_bayes.setups import Setup
 
-KNOWN = {"sample_lean": 0.2, "view_zenith_scale": 0.002, "polarization_gain": 0.01}
-QUANTITIES = (SampleLean(), ViewZenithScale(), PolarizationGain())
+KNOWN = {"sample_lean": 0.2, "view_zenith_scale": 0.002, "tone_curve": 0.02}
+QUANTITIES = (SampleLean(), ViewZenithScale(), ToneCurve())
 ASKED = {
     "method": pb.methods.Laplace(draws=2000),
     "seed": 5,
@@ -59,7 +58,7 @@ def test_a_perfect_set_up_would_have_the_intervals_that_a_fit_of_it_has(fit, cap
 @pytest.mark.parametrize(
     "better",
     [
-        {"polarization_gain": 0.002},
+        {"tone_curve": 0.004},
         pytest.param({"sample_lean": 0.5, "view_zenith_scale": 0.004}, marks=pytest.mark.thorough),
     ],
 )
@@ -91,8 +90,13 @@ def test_it_is_kept_in_a_file_and_the_verdict_names_what_to_know_better(fit, tmp
         "What the set-up is known to makes standard uncertainties larger than"
     )
     better = better_known(view_of(fit), "refractive_index")
-    table = pb.budget(fit, known={"polarization_gain": 0.005})
-    assert better == ("gain of polarization", "0.01", "0.005", table.loc["refractive_index", "sd"])
+    table = pb.budget(fit, known={"tone_curve": 0.01})
+    assert better == (
+        "exponent of the sensor's tone curve",
+        "0.02",
+        "0.01",
+        table.loc["refractive_index", "sd"],
+    )
 
 
 def test_a_capture_states_what_its_set_up_is_known_to(capture: xr.Dataset) -> None:
@@ -102,7 +106,7 @@ def test_a_capture_states_what_its_set_up_is_known_to(capture: xr.Dataset) -> No
 
     better = capture.assign_attrs(sample_lean_uncertainty=0.05)
     asked = ("per_material", ASKED["scene"], None, None, None, 0, "double")
-    usual = {"view_zenith_scale": 0.005, "polarization_gain": 0.005}
+    usual = {"view_zenith_scale": 0.005, "tone_curve": 0.01}
     assert widths(None) == pytest.approx(usual | {"sample_lean": 0.05})
     assert widths({"sample_lean": 0.1}) == pytest.approx(usual | {"sample_lean": 0.1})
 
@@ -118,11 +122,11 @@ def test_what_only_adds_is_known_to_its_standard_deviation(capture: xr.Dataset) 
 def test_what_to_know_better_stands_beside_further_views(fit: xr.DataTree) -> None:
     told = fit.copy()
     told["next_views"] = xr.Dataset()
-    now, half = pb.budget(fit), pb.budget(fit, known={"polarization_gain": 0.005})
+    now, half = pb.budget(fit), pb.budget(fit, known={"tone_curve": 0.01})
     share = 1.0 - half.loc["refractive_index", "sd"] / now.loc["refractive_index", "sd"]
     assert setup_beside_views(view_of(told)) == [
-        "Without further views, the gain of polarization known to 0.005 instead of 0.01 narrows "
-        f"the 95% interval of refractive_index by {share:.0%}."
+        "Without further views, the exponent of the sensor's tone curve known to 0.01 instead of "
+        f"0.02 narrows the 95% interval of refractive_index by {share:.0%}."
     ]
     assert setup_beside_views(view_of(fit)) == []
 

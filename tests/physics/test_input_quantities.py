@@ -11,9 +11,10 @@ from polar_bayes.physics.input_quantities import (
     AbstractInputQuantity,
     AmbientLight,
     AnalyzerRoll,
+    IncidenceAngle,
     LightAzimuth,
     LightZenith,
-    PolarizationGain,
+    PolarizationLoss,
     SampleLean,
     ToneCurve,
     ViewZenithScale,
@@ -47,6 +48,9 @@ def turned(light: Light, degrees: float) -> Light:
 AIMED = {
     LightZenith(): GEOMETRY._replace(light_zenith=GEOMETRY.light_zenith + 0.1),
     LightAzimuth(): GEOMETRY._replace(light_azimuth=GEOMETRY.light_azimuth + 0.1),
+    IncidenceAngle(): GEOMETRY._replace(
+        light_zenith=GEOMETRY.light_zenith + 0.1, view_zenith=GEOMETRY.view_zenith + 0.1
+    ),
     ViewZenithScale(): GEOMETRY._replace(view_zenith=1.1 * GEOMETRY.view_zenith),
     SampleLean(): GEOMETRY._replace(
         light_zenith=GEOMETRY.light_zenith + 0.1,
@@ -55,7 +59,7 @@ AIMED = {
 }
 RECORDED = {
     AnalyzerRoll(): turned(LIGHT, 0.1),
-    PolarizationGain(): Light(LIGHT.intensity, 1.1 * LIGHT.q, 1.1 * LIGHT.u),
+    PolarizationLoss(): Light(LIGHT.intensity, 0.9 * LIGHT.q, 0.9 * LIGHT.u),
     AmbientLight(): Light(
         LIGHT.intensity + 0.1,
         *(x * LIGHT.intensity / (LIGHT.intensity + 0.1) for x in (LIGHT.q, LIGHT.u)),
