@@ -2,7 +2,7 @@
 
     python benchmarks/model_criticism.py right --fits 334    share of right models flagged
     python benchmarks/model_criticism.py perfect --fits 334  the same of bare, perfect set-ups
-    python benchmarks/model_criticism.py wrong --fits 5      wrong worlds at 16, 40, 120 readings
+    python benchmarks/model_criticism.py wrong --fits 3      wrong worlds, of 40 readings
     python benchmarks/model_criticism.py wrong --chosen      the same where the fit chooses a scene
     python benchmarks/model_criticism.py chosen --fits 100   coverage where the scene is chosen, too
     python benchmarks/model_criticism.py cost                seconds of the checks and of a warm fit
@@ -39,7 +39,7 @@ from polar_bayes.scenes import scene_library
 from polar_bayes.setups import SETUPS
 from polar_bayes.simulation import Protocol
 
-READINGS = (16, 40, 120)
+READINGS = 40
 COST_FITS = 5
 now = time.perf_counter
 MISS = 2.0
@@ -55,6 +55,15 @@ def unchanged(capture: xr.Dataset, random: np.random.Generator) -> xr.Dataset:
     return capture
 
 
+class Mirrored(Protocol):
+    """The light comes from the zenith angle of the view, as on a goniometer."""
+
+    def angles(self) -> dict[str, np.ndarray]:
+        """Directions of every view."""
+        found = super().angles()
+        return found | {"light_zenith": found["view_zenith"]}
+
+
 @dataclasses.dataclass(frozen=True)
 class World:
     """What is simulated, what happens to the readings, and the set-up that is fitted."""
@@ -68,19 +77,28 @@ class World:
     method: str = "nuts"
     largest_view_zenith: float = 85.0
     azimuths: tuple[float, ...] = (180.0, 150.0, 120.0, 60.0)
+    wavelengths: tuple[float, ...] = ()
 
     def capture(self, readings: int, seed: int) -> xr.Dataset:
         """A capture of this world, with as many views as there are readings of each variable."""
+        protocol = Protocol(
+            views=readings,
+            wavelengths=self.wavelengths,
+            largest_view_zenith=self.largest_view_zenith,
+            azimuths=self.azimuths,
+        )
+        if self.setup == "goniometer":
+            protocol = Mirrored(
+                views=readings,
+                largest_view_zenith=78.0,
+                azimuths=(180.0,),
+                wavelengths=self.wavelengths,
+            )
         made = pb.simulate(
             self.preset,
             scene=self.truth or SETUPS[self.setup].scene,
             links=SETUPS[self.setup].links,
-            protocol=Protocol(
-                views=readings,
-                wavelengths=(),
-                largest_view_zenith=self.largest_view_zenith,
-                azimuths=self.azimuths,
-            ),
+            protocol=protocol,
             parameters=dict(self.parameters),
             noise=dict(self.noise),
             seed=seed,
@@ -144,6 +162,35 @@ def stray(capture: xr.Dataset, random: np.random.Generator) -> xr.Dataset:
     return capture.assign(dop=capture["dop"] * share)
 
 
+def counted(count: Callable[[Any], Any]) -> Change:
+    """Frames behind a polarizer as a sensor counts them, which sees 1 of the brightest light."""
+
+    def change(capture: xr.Dataset, random: np.random.Generator) -> xr.Dataset:
+        del random
+        light = capture["intensity"] / capture["intensity"].max()
+        found = {}
+        for name in ("q", "u"):
+            one, other = (count(0.5 * light * (1.0 + sign * capture[name])) for sign in (1.0, -1.0))
+            found[name] = np.clip((one - other) / (one + other), -0.999, 0.999)
+        return capture.assign({**found, "intensity": count(light)})
+
+    return change
+
+
+def walled(capture: xr.Dataset, random: np.random.Generator) -> xr.Dataset:
+    """Unpolarized light besides the lamp's, a tenth of the mean brightness, in every view."""
+    del random
+    light = 0.1 * float(capture["intensity"].mean())
+    share = capture["intensity"] / (capture["intensity"] + light)
+    found = {name: capture[name] * share for name in ("dop", "q", "u") if name in capture}
+    return capture.assign({**found, "intensity": capture["intensity"] + light})
+
+
+def twice_off(quantity: Any) -> dict[str, float]:
+    """The offset of an input quantity at twice its standard uncertainty."""
+    return {name: 2.0 * float(pb.PRIORS[name].variance) ** 0.5 for name in quantity.parameters}
+
+
 def clipped(capture: xr.Dataset, random: np.random.Generator) -> xr.Dataset:
     """A sensor that saturates at 60% of the largest degree of polarization, unmarked."""
     del random
@@ -163,39 +210,43 @@ def _part(scene: pb.Scene, **changes: Any) -> pb.Scene:
 P, T = pb.physics, pb.instrument
 WRONG: dict[str, World] = {
     # The surface.
-    "GGX fitted as Beckmann": World("paper", truth=_part(PAPER, distribution=P.GGX())),
+    "GGX fitted as Beckmann": World("polarimeter", truth=_part(PAPER, distribution=P.GGX())),
     "GGX fitted as Beckmann, camera": World("camera", truth=_part(CAMERA, distribution=P.GGX())),
     "grooves fitted as isotropic": World(
-        "paper",
+        "polarimeter",
         truth=_part(PAPER, slopes=P.AnisotropicSlopes()),
         parameters={"roughness": 0.05, "roughness_across": 0.3},
     ),
-    "no shadowing": World("paper", "leaf", truth=_part(PAPER, shadowing=P.NoShadowing())),
+    "no shadowing": World("polarimeter", "leaf", truth=_part(PAPER, shadowing=P.NoShadowing())),
     "a coat": World(
-        "paper",
+        "polarimeter",
         truth=_part(PAPER, coat=P.ClearCoat()),
         parameters={"coat_refractive_index": 1.6, "coat_absorbance": 0.3},
     ),
     "polarized light": World(
-        "paper",
+        "polarimeter",
         truth=_part(
             PAPER, illumination=P.PointSource(P.LinearPolarization(degree=0.3, angle=30.0))
         ),
     ),
     "a sample that leans by 5 degrees": World(
-        "paper",
+        "polarimeter",
         truth=_part(PAPER, normal=T.TiltedNormal()),
         parameters={"normal_tilt_x": 5.0},
     ),
     "a near mirror that no view sees": World(
-        "paper", "glass", parameters={"roughness": 0.01}, azimuths=(120.0, 60.0)
+        "polarimeter", "glass", parameters={"roughness": 0.01}, azimuths=(120.0, 60.0)
     ),
     "the same by laplace": World(
-        "paper", "glass", parameters={"roughness": 0.01}, azimuths=(120.0, 60.0), method="laplace"
+        "polarimeter",
+        "glass",
+        parameters={"roughness": 0.01},
+        azimuths=(120.0, 60.0),
+        method="laplace",
     ),
     # The body.
     "turbid body fitted as depolarizer": World(
-        "paper", "leaf", truth=_part(PAPER, subsurface=P.TurbidMedium())
+        "polarimeter", "leaf", truth=_part(PAPER, subsurface=P.TurbidMedium())
     ),
     "unpolarized body fitted as Lambertian": World(
         "camera", "leaf", truth=_part(CAMERA, subsurface=P.Unpolarized())
@@ -203,8 +254,8 @@ WRONG: dict[str, World] = {
     "depolarizer fitted as Lambertian": World(
         "camera", "leaf", truth=_part(CAMERA, subsurface=P.Depolarizer())
     ),
-    "index above the prior": World("paper", parameters={"refractive_index": 2.3}),
-    "index below the prior": World("paper", parameters={"refractive_index": 1.15}),
+    "index above the prior": World("polarimeter", parameters={"refractive_index": 2.3}),
+    "index below the prior": World("polarimeter", parameters={"refractive_index": 1.15}),
     "a plate of index 2.3": World(
         "goniometer", "glass", parameters={"refractive_index": 2.3, "subsurface_fraction": 0.02}
     ),
@@ -213,19 +264,19 @@ WRONG: dict[str, World] = {
         "camera", "water", truth=_part(CAMERA, illumination=P.UniformSky())
     ),
     "light 12 degrees wide": World(
-        "paper", truth=_part(PAPER, illumination=P.Disc(half_width=12.0))
+        "polarimeter", truth=_part(PAPER, illumination=P.Disc(half_width=12.0))
     ),
-    "stray light": World("paper", change=stray),
+    "stray light": World("polarimeter", change=stray),
     # The instrument.
-    "angles 3 degrees off": World("paper", change=turned),
+    "angles 3 degrees off": World("polarimeter", change=turned),
     "angles 3 degrees off, goniometer": World(
         "goniometer", "glass", parameters={"subsurface_fraction": 0.02}, change=turned
     ),
-    "DoLP reads 20% low": World("paper", change=scaled(dop=0.8)),
+    "DoLP reads 20% low": World("polarimeter", change=scaled(dop=0.8)),
     "s and p swapped": World(
         "goniometer", "glass", parameters={"subsurface_fraction": 0.02}, change=scaled(q=-1.0)
     ),
-    "a smooth error of 6%": World("paper", change=drifting),
+    "a smooth error of 6%": World("polarimeter", change=drifting),
     "a smooth error of 6%, camera": World("camera", change=drifting),
     "a channel that saturates": World("camera", change=clipped),
     # The noise.
@@ -235,10 +286,47 @@ WRONG: dict[str, World] = {
         parameters={"subsurface_fraction": 0.02},
         noise={"stokes_error_factor": 30.0},
     ),
-    "one reading in ten spoiled": World("paper", change=spoiled),
+    "one reading in ten spoiled": World("polarimeter", change=spoiled),
     "one reading in ten spoiled, camera": World("camera", change=spoiled),
-    "noted to one decimal": World("paper", change=rounded),
-    "a quarter of the views entered four times": World("paper", change=repeated),
+    "noted to one decimal": World("polarimeter", change=rounded),
+    "a quarter of the views entered four times": World("polarimeter", change=repeated),
+    # What nobody sees.
+    "a water film on a rough body": World(
+        "camera", truth=_part(CAMERA, coat=P.ClearCoat(1.333, 0.0))
+    ),
+    "a thick water film on a plate": World(
+        "goniometer",
+        "glass",
+        truth=_part(GONIOMETER, coat=P.ClearCoat(1.333, 0.0)),
+        parameters={"subsurface_fraction": 0.02},
+    ),
+    "a quarter-wave film on a plate": World(
+        "goniometer",
+        "glass",
+        truth=_part(GONIOMETER, coat=P.ThinFilm(1.38, 115.0)),
+        parameters={"subsurface_fraction": 0.02},
+        wavelengths=(633.0,),
+    ),
+    # What a set-up does, further off than it states.
+    "frames with a tone curve": World("camera", change=counted(lambda light: light ** (1 / 2.2))),
+    "a sensor that compresses": World("camera", change=counted(lambda light: light / (1 + light))),
+    "a wall that gives back a tenth": World("camera", change=walled),
+    "a wall that gives back a tenth, table": World("polarimeter", change=walled),
+    "zeniths 3% long": World("polarimeter", change=scaled(view_zenith=1.03)),
+    "zeniths 3% long, camera": World("camera", change=scaled(view_zenith=1.03)),
+    # Each input quantity at twice what it is known to.
+    **{
+        f"{name}: {quantity.name} off by twice its uncertainty": World(
+            name,
+            truth=SETUPS[name].scene.known_to([quantity]),
+            parameters=twice_off(quantity),
+        )
+        for name in ("polarimeter", "camera")
+        for quantity in SETUPS[name].known
+    },
+    "goniometer: angle zero off by twice its uncertainty": World(
+        "goniometer", "glass", parameters={"subsurface_fraction": 0.02, "angle_zero": 1.5}
+    ),
 }
 
 
@@ -267,13 +355,12 @@ def judge(capture: xr.Dataset, truth: Mapping[str, float], **settings: Any) -> d
     }
 
 
-def wrong(fits: int, *, chosen: bool = False) -> Any:
-    """Every wrong world at every number of readings, fitted by its set-up or by a chosen scene."""
-    for readings in READINGS:
+def wrong(fits: int, *, readings: int = READINGS, chosen: bool = False) -> Any:
+    """Every wrong world, fitted by its set-up or by a chosen scene."""
+    for seed in range(fits):
         for name, world in WRONG.items():
-            for seed in range(fits):
-                key = f"{name}{', scene chosen' * chosen}|{readings}|{seed}"
-                yield key, lambda w=world, r=readings, s=seed: _wrong(w, r, s, chosen=chosen)
+            key = f"{name}{', scene chosen' * chosen}|{readings}|{seed}"
+            yield key, lambda w=world, s=seed: _wrong(w, readings, s, chosen=chosen)
 
 
 def _wrong(world: World, readings: int, seed: int, *, chosen: bool) -> dict[str, Any]:
@@ -283,18 +370,9 @@ def _wrong(world: World, readings: int, seed: int, *, chosen: bool) -> dict[str,
     return judge(capture, truth, scene=scene, method=world.method, seed=seed)
 
 
-class Mirrored(Protocol):
-    """The light comes from the zenith angle of the view, as on a goniometer."""
-
-    def angles(self) -> dict[str, np.ndarray]:
-        """Directions of every view."""
-        found = super().angles()
-        return found | {"light_zenith": found["view_zenith"]}
-
-
 PLATE = Mirrored(views=30, largest_view_zenith=78.0, azimuths=(180.0,), wavelengths=())
 RIGHT: tuple[tuple[str, Protocol], ...] = (
-    ("paper", Protocol(views=40, wavelengths=(), largest_view_zenith=80.0)),
+    ("polarimeter", Protocol(views=40, wavelengths=(), largest_view_zenith=80.0)),
     ("camera", Protocol(views=16, wavelengths=(), largest_view_zenith=80.0)),
     ("goniometer", PLATE),
     ("picture", Mirrored(views=8, largest_view_zenith=70.0, azimuths=(180.0,), wavelengths=())),
@@ -314,7 +392,7 @@ def right(fits: int, *, perfect: bool = False, method: str = "nuts") -> Any:
 
 
 def _right(setup: str, layout: Protocol, seed: int, perfect: bool, method: str) -> dict[str, Any]:
-    scene = SETUPS[setup].scene
+    scene = SETUPS[setup].scene.known_to(SETUPS[setup].known)
     capture, truth = drawn_from_priors(setup, scene, layout, seed, perfect=perfect)
     return judge(capture, truth, scene=setup, method=method, seed=seed)
 
@@ -441,6 +519,7 @@ def main() -> None:
     parser.add_argument("part", choices=("right", "perfect", "wrong", "chosen", "cost"))
     parser.add_argument("--fits", type=int, default=5)
     parser.add_argument("--chosen", action="store_true", help="wrong: the fit chooses its scene")
+    parser.add_argument("--readings", type=int, default=READINGS, help="wrong: of each variable")
     parser.add_argument("--method", default="nuts", help="right, perfect: of the fits")
     parser.add_argument("--only", default="", help="worlds whose name holds this text")
     parser.add_argument("--keep", type=Path, help="file of JSON lines", default="criticism.jsonl")
@@ -457,7 +536,7 @@ def main() -> None:
     worlds = {
         "right": functools.partial(right, method=asked.method),
         "perfect": functools.partial(right, perfect=True, method=asked.method),
-        "wrong": functools.partial(wrong, chosen=asked.chosen),
+        "wrong": functools.partial(wrong, readings=asked.readings, chosen=asked.chosen),
         "chosen": chosen,
     }
     for key, run in worlds[asked.part](asked.fits):
