@@ -8,6 +8,15 @@ of its layer: `physics`, `instrument`, `links`, `methods`, `models`, `importers`
 
 from polar_bayes.namespace import attach, force_numpyro_import
 
-__getattr__, __dir__, __all__ = attach(__name__, __file__)
+load_name, __dir__, __all__ = attach(__name__, __file__)
+
+
+def __getattr__(name: str) -> object:
+    if name != "__version__":
+        return load_name(name)
+    from importlib.metadata import version  # as slow as all of this module
+
+    return version("polar_bayes")
+
 
 force_numpyro_import()

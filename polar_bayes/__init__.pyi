@@ -91,3 +91,5 @@ from .scenes.scene_file import (
     save_scene as save_scene,
 )
 from .simulation import simulate as simulate
+
+__version__: str

@@ -7,6 +7,7 @@ import inspect
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,10 @@ def test_the_names_of_the_contract_are_there() -> None:
     assert dir(pb) == list(pb.__all__)
 
 
+def test_the_package_says_its_version_as_its_metadata_do() -> None:
+    assert pb.__version__ == version("polar_bayes")
+
+
 def test_a_name_that_does_not_exist_is_an_attribute_error() -> None:
     for namespace in namespaces().values():
         with pytest.raises(AttributeError, match="fitt"):
@@ -80,6 +85,7 @@ def test_every_error_can_be_caught_as_one_kind():
 
 LOADED = f"""
 import sys
+from importlib.metadata import version
 from pathlib import Path
 heavy = {HEAVY!r}
 loaded = sorted({{name.split(".")[0] for name in sys.modules}} & set(heavy))
@@ -138,6 +144,7 @@ def test_programs_are_kept_on_the_disk_from_the_first_that_is_compiled(tmp_path,
 
 WHOLE = """
 import sys
+from importlib.metadata import version
 from pathlib import Path
 polar_bayes.fit
 import numpyro.distributions
