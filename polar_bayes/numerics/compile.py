@@ -21,6 +21,7 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 
 from polar_bayes.errors import FitError
+from polar_bayes.numerics.kept_programs import KeptProgram, kept_program
 from polar_bayes.paths import compiled_folder, make_private
 from polar_bayes.progress import Progress
 
@@ -99,10 +100,12 @@ def compiled(function: Callable) -> Any:
 class JitOnce:
     """A function that is traced under the lock, and compiled once for each shape and device.
 
-    The shape is that of the first argument; those of others must follow from it.
+    The shape is that of the first argument; those of others must follow from it. With a key that
+    no other function has, in any process, the next process loads the program from the disk.
     """
 
-    def __init__(self, function: Callable) -> None:
+    def __init__(self, function: Callable, key: str = "") -> None:
+        self.key = key
         self._function = compiled(function)
         self._compilations: dict[Hashable, _Compilation] = {}
 
@@ -129,8 +132,17 @@ class JitOnce:
         with TRACING_LOCK:
             key = self._key(arguments)
             if key not in self._compilations:
-                self._compilations[key] = _Compilation(self._function.lower(*arguments))
+                kept = kept_program(self.key, arguments)
+                is_kept = kept is not None and kept.exists
+                lowered = None if is_kept else self._function.lower(*arguments)
+                lower = functools.partial(self._lower, arguments, jax.config.jax_enable_x64)
+                self._compilations[key] = _Compilation(lowered, lower, kept)
             return self._compilations[key]
+
+    def _lower(self, arguments: tuple, double: bool) -> Any:
+        """The lowered program, for a thread that asks later."""
+        with TRACING_LOCK, jax.enable_x64(double):
+            return self._function.lower(*arguments)
 
     @staticmethod
     def _key(arguments: tuple) -> Hashable:
@@ -139,10 +151,12 @@ class JitOnce:
 
 
 class _Compilation:
-    """A lowered program, compiled once, by the first thread that asks."""
+    """A program that is lowered or kept on the disk, made once, by the first thread that asks."""
 
-    def __init__(self, lowered: Any) -> None:
+    def __init__(self, lowered: Any, lower: Callable[[], Any], kept: KeptProgram | None) -> None:
         self._lowered = lowered
+        self._lower = lower
+        self._kept = kept
         self._compiled: Any = None
         self._program: Callable | None = None
         self._lock = threading.Lock()
@@ -152,11 +166,20 @@ class _Compilation:
         # fits: what is still in the queue is compiled by the thread that needs it.
         if self._program is None:
             with self._lock:
-                if self._lowered is not None:
-                    self._compiled, self._lowered = self._lowered.compile(), None
+                if self._compiled is None:
+                    self._compiled = self._make()
                 check_memory(bytes_of(self._compiled))
                 self._program = self._compiled
         return self._program
+
+    def _make(self) -> Any:
+        found = None if self._kept is None or self._lowered is not None else self._kept.load()
+        if found is None:
+            found = (self._lowered or self._lower()).compile()
+            if self._kept is not None:
+                _COMPILER_THREAD.submit(self._kept.save, found)
+        self._lowered = None
+        return found
 
 
 def bytes_of(program: Any) -> int:

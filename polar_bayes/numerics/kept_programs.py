@@ -1,0 +1,122 @@
+"""Compiled programs on the disk, which the next process finds without tracing them again.
+
+JAX's own cache finds a program by its text. To write that text, a model must be traced and lowered,
+which takes longer than to load the program. Here a program is found by what it is made from: a key
+that its maker gives, the shapes of its arguments, the sources of this package, the versions of
+libraries, what JAX is set to, and the processor. What is not known to that extent has no key.
+"""
+
+import contextlib
+import functools
+import hashlib
+import os
+import pickle
+import platform
+import shutil
+from collections.abc import Callable, Iterable
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax.experimental import serialize_executable
+
+from polar_bayes.paths import compiled_folder
+
+LIBRARIES = ("jax", "jaxlib", "numpyro", "equinox", "tinygp", "numpy")
+
+MOST_ENVIRONMENTS = 3
+"""Of sources, libraries and settings, whose programs stay on the disk."""
+
+
+class KeptProgram:
+    """The place of one compiled program on the disk.
+
+    Args:
+        path: Its file.
+        arguments: What it is called with, or `ShapeDtypeStruct` of it.
+    """
+
+    def __init__(self, path: Path, arguments: tuple) -> None:
+        self._path = path
+        self._arguments = jax.tree.structure((arguments, {}))
+
+    @property
+    def exists(self) -> bool:
+        """Whether there is something to load."""
+        return self._path.is_file()
+
+    def load(self) -> Callable | None:
+        """The program; None where it is damaged, or gone by now."""
+        try:
+            program, result = pickle.loads(self._path.read_bytes())
+            return serialize_executable.deserialize_and_load(program, self._arguments, result)
+        except Exception:  # whatever is wrong with it, it can be compiled
+            self._path.unlink(missing_ok=True)
+            return None
+
+    def save(self, compiled: Any) -> None:
+        """Keep a program, where it can be: one that holds arrays, or whose result cannot."""
+        with contextlib.suppress(Exception):
+            program, _, result = serialize_executable.serialize(compiled)
+            written = pickle.dumps((program, result))
+            if pickle.loads(written)[1] != result:
+                return
+            _make_room(self._path.parent)
+            part = self._path.with_suffix(f".{os.getpid()}")
+            part.write_bytes(written)
+            part.replace(self._path)
+
+
+def kept_program(key: str, arguments: tuple) -> KeptProgram | None:
+    """The place of a program; None where it has no key, or programs are not kept here."""
+    folder = compiled_folder()
+    if not key or jax.config.jax_compilation_cache_dir != str(folder):
+        return None
+    if jax.device_count() > 1 or jax.default_backend() != "cpu" or jax.config.jax_default_device:
+        return None  # a program runs where it was compiled
+    leaves, tree = jax.tree.flatten(arguments)
+    described = [str(tree), *(_described(leaf) for leaf in leaves), str(jax.config.jax_enable_x64)]
+    return KeptProgram(folder / "programs" / _environment() / _digest([key, *described]), arguments)
+
+
+def _described(leaf: Any) -> str:
+    like = leaf if isinstance(leaf, jax.ShapeDtypeStruct) else jax.typeof(leaf)
+    return f"{like.dtype}{like.shape}{like.weak_type}"
+
+
+def _digest(texts: Iterable[str]) -> str:
+    return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:32]
+
+
+@functools.cache
+def _environment() -> str:
+    """What all programs of a process depend on, as one word."""
+    models = find_spec("polar_bayes.models")
+    roots = {Path(__file__).parents[1], *map(Path, models.submodule_search_locations or ())}
+    sources = sorted(path for root in roots for path in root.rglob("*.*") if path.suffix in (".py", ".csv"))
+    settings = {n: x for n, x in jax.config.values.items() if "cache" not in n and "log" not in n}
+    processor = Path("/proc/cpuinfo")
+    lines = processor.read_text().splitlines() if processor.is_file() else [platform.processor()]
+    return _digest(
+        [
+            *(hashlib.sha256(path.read_bytes()).hexdigest() for path in sources),
+            *(version(library) for library in LIBRARIES),
+            *(f"{name}={value}" for name, value in sorted(settings.items())),
+            os.environ.get("XLA_FLAGS", ""),
+            platform.machine(),
+            platform.python_version(),
+            *sorted({line for line in lines if line.startswith(("flags", "Features", "model name"))}),
+        ]
+    )
+
+
+def _make_room(folder: Path) -> None:
+    """Make the folder of an environment, and remove those that were used before the last ones."""
+    if folder.is_dir():
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    others = sorted(folder.parent.iterdir(), key=lambda path: path.stat().st_mtime)
+    for old in others[:-MOST_ENVIRONMENTS]:
+        shutil.rmtree(old, ignore_errors=True)
