@@ -25,7 +25,6 @@ from plates import LINKS, PLATE, plates
 
 import polar_bayes as pb
 from polar_bayes.inference.hierarchical_reparam import (
-    ExpansionPoint,
     HierarchicalReparam,
     ReparamInputs,
     find_groups,
@@ -108,15 +107,16 @@ def gradient() -> None:
             assert groups is not None
             transport = HierarchicalReparam(program, groups)
             local, common = groups.local.shape, groups.common.size
-            point = ExpansionPoint(
+            given = ReparamInputs(
                 jnp.zeros(common),
                 jnp.eye(common),
                 jnp.zeros(local),
                 jnp.zeros(local),
                 jnp.broadcast_to(jnp.eye(local[1]), (*local, local[1])),
                 jnp.zeros((*local, common)),
+                data,
             )
-            given, w = ReparamInputs(point, data), jnp.zeros(program.size)
+            w = jnp.zeros(program.size)
             both = jax.jit(jax.value_and_grad(transport.potential))
             jax.block_until_ready(both(w, given))
             times = []

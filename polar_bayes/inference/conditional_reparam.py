@@ -21,8 +21,7 @@ Source:
 
 import dataclasses
 import functools
-from collections.abc import Callable
-from typing import Any
+from typing import Any, override
 
 import equinox as eqx
 import jax
@@ -32,7 +31,7 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
-from polar_bayes.inference.program import Program, in_blocks
+from polar_bayes.inference.program import AbstractDensity, Program, in_blocks
 from polar_bayes.inference.sum_reparam import SumReparam, find_sum
 from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.observation.data import Observations
@@ -48,23 +47,17 @@ SIDE_BY_SIDE = 50
 """Vectors that are vectorized over."""
 
 
-class ModeRegression(eqx.Module):
-    """The posterior mode, and the regression of the coefficients on the other coordinates there."""
+class ConditionalInputs(eqx.Module):
+    """The mode, with the regression of the coefficients on the others there, and the capture."""
 
     others: Float[Array, " other"]
     coefficients: Float[Array, " coefficient"]
     slope: Float[Array, "coefficient other"]
-
-
-class ConditionalInputs(eqx.Module):
-    """The arguments of the potential besides the coordinates."""
-
-    point: ModeRegression
     data: Observations
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class ConditionalReparam:
+class ConditionalReparam(AbstractDensity[ConditionalInputs]):
     """The map between coordinates x, in which the coefficients are standardized, and a program's.
 
     Other coordinates are the same in both, but for two along a sum, where there are such; every
@@ -77,8 +70,8 @@ class ConditionalReparam:
     others: np.ndarray
     sums: SumReparam | None
 
+    @override
     def potential(self, x: Float[Array, " size"], given: ConditionalInputs) -> Float[Array, ""]:
-        """Minus the log density of x, up to a constant."""
         x, w, log_volume = self._moved(x, given)
         # Not of one flat vector: the optics, which depend on other sites only, are then found to be
         # the same as in the Gauss-Newton step, and computed once.
@@ -99,16 +92,6 @@ class ConditionalReparam:
         x = np.array(z)
         x[:, self.coefficients] = 0.0
         return x
-
-    @functools.cached_property
-    def potential_jit(self) -> Callable[[Array, ConditionalInputs], Array]:
-        """The potential; the model is traced once, however many programs compute it."""
-        return jax.jit(self.potential, inline=True)
-
-    @functools.cached_property
-    def value_and_gradient(self) -> JitOnce:
-        """The potential with its gradient, compiled."""
-        return JitOnce(jax.value_and_grad(self.potential_jit))
 
     @functools.cached_property
     def forward_of_block(self) -> JitOnce:
@@ -136,23 +119,21 @@ class ConditionalReparam:
             others, slope = at, np.linalg.solve(moves.T, slope.T).T
         dtype = data.brightness.dtype
         parts = others, mode[self.coefficients], slope
-        return ConditionalInputs(
-            ModeRegression(*(jnp.asarray(part, dtype) for part in parts)), data
-        )
+        return ConditionalInputs(*(jnp.asarray(part, dtype) for part in parts), data)
 
     def inputs_like(self, data: Observations) -> ConditionalInputs:
         """Inputs of the shapes that `inputs` gives, for programs to be compiled."""
         dtype, count = data.brightness.dtype, len(self.coefficients)
         others = jnp.zeros(len(self.others), dtype)
         slope = jnp.zeros((count, len(self.others)), dtype)
-        return ConditionalInputs(ModeRegression(others, jnp.zeros(count, dtype), slope), data)
+        return ConditionalInputs(others, jnp.zeros(count, dtype), slope, data)
 
     def _moved(
         self, x: Float[Array, " size"], given: ConditionalInputs
     ) -> tuple[Float[Array, " size"], Float[Array, " coefficient"], Float[Array, ""]]:
         """Other coordinates of the program, the coefficients, and the log volume of the map."""
-        point, noise, volume = given.point, x[self.coefficients], jnp.zeros((), x.dtype)
-        start = point.coefficients + point.slope @ (x[self.others] - point.others)
+        noise, volume = x[self.coefficients], jnp.zeros((), x.dtype)
+        start = given.coefficients + given.slope @ (x[self.others] - given.others)
         if self.sums is not None:
             x, volume = self.sums.forward(x, given.data)
         mean, lower = self._conditional(x, start, given)

@@ -16,8 +16,8 @@ efficient sampling is.
 
 Given the common parameters, the groups are independent, so each has a mode search and a Hessian of
 its own, which makes captures of many groups cheap. A search over thousands of coordinates from a
-prior draw ends in a poor mode of some group. `fit_reparam` therefore searches each group alone from
-many starts, first with common parameters of its own, then with those of all groups. Last, it
+prior draw ends in a poor mode of some group. `ReparamSearch` therefore searches each group alone
+from many starts, first with common parameters of its own, then with those of all groups. Last, it
 optimizes all coordinates jointly in w, in which a population of zero width is no singularity: that
 is the mode of the population with its members integrated out.
 
@@ -31,7 +31,7 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import NamedTuple, override
 
 import equinox as eqx
 import jax
@@ -42,7 +42,14 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.program import Model, Program, compile_program, from_prior
+from polar_bayes.inference.program import (
+    THREADS,
+    AbstractDensity,
+    Model,
+    Program,
+    compile_program,
+    from_prior,
+)
 from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.numerics.optimize import (
     Modes,
@@ -107,80 +114,29 @@ def group_of(data: Observations, number: int) -> Observations:
     return dataclasses.replace(jax.tree.map(cut, data), dims=((axis, 1), *data.dims[1:]))
 
 
+Starts = tuple[np.ndarray, np.ndarray]
+"""Coordinates of a group, (start, local), and common ones, (start, common)."""
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class GroupModel:
     """The model of one group, compiled once for all groups of all captures of a layout."""
 
     program: Program
-    groups: Groups
-
-
-def find_group_model(model: Model, groups: Groups, data: Observations) -> GroupModel | None:
-    """The model of one group; None where it differs between groups, as by a prior for each."""
-    first = group_of(data, 0)
-    try:
-        program = compile_program(model, first)
-    except (TypeError, ValueError):  # arrays of the wrong length for one group
-        return None
-    single = find_groups(program, first)
-    if single is None or single.local.shape != (1, groups.local.shape[1]):
-        return None
-    return GroupModel(program, single) if single.common.size == groups.common.size else None
-
-
-Starts = tuple[np.ndarray, np.ndarray]
-"""Coordinates of a group, (start, local), and common ones, (start, common)."""
-
-
-class GroupProgram:
-    """The groups of one capture, each by itself."""
-
-    def __init__(self, group_model: GroupModel, data: Observations, threads: int = 2) -> None:
-        self._program = group_model.program
-        self._local, self._common = group_model.groups.local[0], group_model.groups.common
-        self._parts = [group_of(data, number) for number in range(data.dims[0][1])]
-        self._dtype = data.brightness.dtype
-        self._threads = threads
+    local: np.ndarray
+    common: np.ndarray
 
     def find_modes(
         self,
-        starts: Callable[[int], Starts],
+        part: Observations,
+        where: str,
+        starts: Starts,
         common: np.ndarray,
         movable: np.ndarray,
-        progress: Callable[[float], None],
-    ) -> list[Modes]:
-        """The modes of every group over its own coordinates and the movable common ones."""
-
-        def of_group(number: int) -> Modes:
-            # A thread starts with the settings of the process, not with those of this fit.
-            with jax.enable_x64(self._dtype == jnp.float64):
-                return self._find_modes(number, starts(number), common, movable)
-
-        # Compiled before the threads start: only this thread knows the deadline.
-        z = jnp.zeros(self._program.size, self._dtype)
-        self._program.value_and_gradient.program(z, self._parts[0])
-        found: list[Modes] = []
-        with ignore_line_search_warnings(), ThreadPoolExecutor(self._threads) as pool:
-            for modes in pool.map(of_group, range(len(self._parts))):
-                found.append(modes)
-                progress(len(found) / len(self._parts))
-        return found
-
-    def expand(
-        self, number: int, local: np.ndarray, common: np.ndarray, sd: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Gradient, Hessian and mixed derivatives of the potential in a group's coordinates."""
-        potential, z = self._potential(number), self._join(local, common)
-        rows = central_difference_hessian(potential, z, sd, self._dtype, self._local)
-        hessian = np.nan_to_num(rows)
-        own, mixed = symmetrize(hessian[:, self._local]), hessian[:, self._common]
-        return np.nan_to_num(potential(z)[1][self._local]), own, mixed
-
-    def _find_modes(
-        self, number: int, starts: Starts, common: np.ndarray, movable: np.ndarray
     ) -> Modes:
-        whole, size = self._potential(number), self._local.size
-        moving = np.concatenate([self._local, self._common[movable]])
+        """The modes of one group over its own coordinates and the movable common ones."""
+        whole, size = self._potential(part), self.local.size
+        moving = np.concatenate([self.local, self.common[movable]])
 
         def potential(x: np.ndarray) -> tuple[float, np.ndarray]:
             at = common.copy()
@@ -194,26 +150,51 @@ class GroupProgram:
         if modes is None:
             raise FitError(
                 f"none of {len(points)} starts reached a peak of the posterior",
-                where=f"fit: {self._parts[0].dims[0][0]} {number}",
+                where=where,
                 hint="check its readings against the prior predictive, mark them valid=False, or "
                 "give narrower priors",
             )
         return modes
 
-    def _potential(self, number: int) -> ValueAndGradient:
-        return NumpyPotential(self._program.value_and_gradient, self._parts[number], self._dtype)
+    def expand(
+        self, part: Observations, local: np.ndarray, common: np.ndarray, sd: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Gradient, Hessian and mixed derivatives of the potential in a group's coordinates."""
+        potential, z = self._potential(part), self._join(local, common)
+        dtype = part.brightness.dtype
+        hessian = np.nan_to_num(central_difference_hessian(potential, z, sd, dtype, self.local))
+        own, mixed = symmetrize(hessian[:, self.local]), hessian[:, self.common]
+        return np.nan_to_num(potential(z)[1][self.local]), own, mixed
+
+    def _potential(self, part: Observations) -> ValueAndGradient:
+        return NumpyPotential(self.program.value_and_gradient, part, part.brightness.dtype)
 
     def _join(self, local: np.ndarray, common: np.ndarray) -> np.ndarray:
-        z = np.zeros(self._program.size, local.dtype)
-        z[self._local], z[self._common] = local, common
+        z = np.zeros(self.program.size, local.dtype)
+        z[self.local], z[self.common] = local, common
         return z
+
+
+def find_group_model(model: Model, groups: Groups, data: Observations) -> GroupModel | None:
+    """The model of one group; None where it differs between groups, as by a prior for each."""
+    first = group_of(data, 0)
+    try:
+        program = compile_program(model, first)
+    except (TypeError, ValueError):  # arrays of the wrong length for one group
+        return None
+    single = find_groups(program, first)
+    if single is None or single.local.shape != (1, groups.local.shape[1]):
+        return None
+    if single.common.size != groups.common.size:
+        return None
+    return GroupModel(program, single.local[0], single.common)
 
 
 # --- The map between w and the coordinates of the program -----------------------------------------
 
 
-class ExpansionPoint(eqx.Module):
-    """The numbers of the map, which no program contains: moving the point compiles nothing."""
+class ReparamInputs(eqx.Module):
+    """The capture and the expansion point, which is in no program: moving it compiles nothing."""
 
     common: Float[Array, " common"]
     factor: Float[Array, "common common"]
@@ -221,17 +202,11 @@ class ExpansionPoint(eqx.Module):
     gradient: Float[Array, "group local"]
     hessian: Float[Array, "group local local"]
     mixed: Float[Array, "group local common"]
-
-
-class ReparamInputs(eqx.Module):
-    """The arguments of the potential besides the coordinates."""
-
-    point: ExpansionPoint
     data: Observations
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class HierarchicalReparam:
+class HierarchicalReparam(AbstractDensity[ReparamInputs]):
     """The map between the coordinates w and those of a program."""
 
     program: Program
@@ -242,8 +217,8 @@ class HierarchicalReparam:
         """Length of w: common coordinates first, then one group after the other."""
         return self.program.size
 
+    @override
     def potential(self, w: Float[Array, " size"], given: ReparamInputs) -> Float[Array, ""]:
-        """Minus the log density of w, up to a constant."""
         z, log_volume = self.forward(w, given)
         return self.program.potential(z, given.data) - log_volume
 
@@ -251,8 +226,8 @@ class HierarchicalReparam:
         self, w: Float[Array, " size"], given: ReparamInputs
     ) -> tuple[Float[Array, " size"], Float[Array, ""]]:
         """Coordinates of the program, and the log volume of the map, up to a constant."""
-        point, split = given.point, self.groups.common.size
-        common = point.common + point.factor @ w[:split]
+        split = self.groups.common.size
+        common = given.common + given.factor @ w[:split]
         mean, lower = self._conditional(common, given)
         noise = w[split:].reshape(self.groups.local.shape)
         local = mean + solve_triangular(lower, noise[..., None], trans=1, lower=True)[..., 0]
@@ -264,7 +239,7 @@ class HierarchicalReparam:
         common, local = z[self.groups.common], z[self.groups.local]
         mean, lower = self._conditional(common, given)
         noise = jnp.einsum("gji,gj->gi", lower, local - mean)
-        first = jnp.linalg.solve(given.point.factor, common - given.point.common)
+        first = jnp.linalg.solve(given.factor, common - given.common)
         return jnp.concatenate([first, noise.ravel()])
 
     def population_derivatives(
@@ -281,16 +256,6 @@ class HierarchicalReparam:
             return jax.grad(lambda x: self._group_prior(self._join(common, x), data))(local)
 
         return jax.jvp(gradient, (local,), (jnp.ones_like(local),))
-
-    @functools.cached_property
-    def potential_jit(self) -> Callable[[Array, ReparamInputs], Array]:
-        """The potential; the model is traced once, however many programs compute it."""
-        return jax.jit(self.potential, inline=True)
-
-    @functools.cached_property
-    def value_and_gradient(self) -> JitOnce:
-        """The potential with its gradient, compiled."""
-        return JitOnce(jax.value_and_grad(self.potential_jit))
 
     @functools.cached_property
     def forward_jit(self) -> JitOnce:
@@ -328,15 +293,14 @@ class HierarchicalReparam:
         self, common: Float[Array, " common"], given: ReparamInputs
     ) -> tuple[Float[Array, "group local"], Float[Array, "group local local"]]:
         """Mean of every group, and Cholesky factor of its precision, given what is common."""
-        point = given.point
-        gradient, curvature = self.population_derivatives(common, point.local, given.data)
+        gradient, curvature = self.population_derivatives(common, given.local, given.data)
         diagonal = jnp.maximum(curvature, 0.0)[..., None] * jnp.eye(
             curvature.shape[-1], dtype=curvature.dtype
         )
-        lower = jnp.linalg.cholesky(point.hessian + diagonal)
-        slope = point.gradient + point.mixed @ (common - point.common) + gradient
+        lower = jnp.linalg.cholesky(given.hessian + diagonal)
+        slope = given.gradient + given.mixed @ (common - given.common) + gradient
         step = cho_solve((lower, True), slope[..., None])[..., 0]
-        return point.local - step, lower
+        return given.local - step, lower
 
     def _join(self, common: Array, local: Array) -> Array:
         z = jnp.zeros(self.size, local.dtype)
@@ -370,55 +334,20 @@ class GroupModes(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class FittedReparam:
-    """The map with its expansion point."""
-
-    reparam: HierarchicalReparam
-    given: ReparamInputs
-    potential: ValueAndGradient
-    modes: GroupModes
-    decrement: float
-
-    def draw_starts(self, key: Array, chains: int) -> np.ndarray:
-        """Starting points in w: each group at one of its modes, drawn by weight."""
-        random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-        groups, dtype = self.reparam.groups, self.given.point.common.dtype
-        starts = []
-        for _ in range(chains):
-            w = random.normal(size=self.reparam.size)
-            z = np.array(self.reparam.forward_jit(jnp.asarray(w, dtype), self.given))
-            for positions, modes in zip(groups.local, self.modes.of_group, strict=True):
-                which = random.choice(len(modes.weight), p=modes.weight)
-                if which:
-                    z[positions] = modes.z[which]
-            start = np.asarray(self.reparam.inverse_jit(jnp.asarray(z, dtype), self.given), float)
-            usable = np.isfinite(start).all() and np.isfinite(self.potential(start)[0])
-            starts.append(start if usable else np.zeros_like(start))
-        return np.stack(starts)
-
-
-def fit_reparam(
-    group_model: GroupModel,
-    reparam: HierarchicalReparam,
-    data: Observations,
-    key: Array,
-    progress: Progress,
-) -> FittedReparam:
-    """Expand the map around the joint mode of a capture."""
-    return _Fit(GroupProgram(group_model, data), reparam, data, progress).run(key)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Fit:
+class ReparamSearch:
     """The search for the expansion point of one capture."""
 
-    alone: GroupProgram
+    alone: GroupModel
     reparam: HierarchicalReparam
     data: Observations
     progress: Progress
 
-    def run(self, key: Array) -> FittedReparam:
-        """Alternate between expansion and joint optimization until the mode stays in place."""
+    def run(self, key: Array) -> tuple[ReparamInputs, NumpyPotential, GroupModes]:
+        """Alternate between expansion and joint optimization until the mode stays in place.
+
+        Returns:
+            The map with its expansion point, the potential there, and the modes it began at.
+        """
         groups, size, dtype = self.reparam.groups, self.reparam.size, self.dtype
         modes = self.group_modes(key)
         common, local = modes.common, np.stack([each.z[0] for each in modes.of_group])
@@ -438,31 +367,33 @@ class _Fit:
             self.progress("joining the patches", (number + 1) / MOST_ROUNDS)
             if number and np.linalg.norm(w) < 0.1 * np.sqrt(w.size):
                 break
-        given, potential = self.expand(common, local, factor, modes)
-        decrement = float(np.linalg.norm(potential(np.zeros(size))[1]))
-        return FittedReparam(self.reparam, given, potential, modes, decrement)
+        return *self.expand(common, local, factor, modes), modes
 
     @property
     def dtype(self) -> np.dtype:
         return self.data.brightness.dtype
 
+    @functools.cached_property
+    def parts(self) -> list[Observations]:
+        """The groups, each as a capture of its own."""
+        return [group_of(self.data, number) for number in range(self.reparam.groups.count)]
+
     def expand(
         self, common: np.ndarray, local: np.ndarray, factor: np.ndarray, modes: GroupModes
-    ) -> tuple[ReparamInputs, ValueAndGradient]:
+    ) -> tuple[ReparamInputs, NumpyPotential]:
         """The map around a point, from the derivatives of the readings without the population."""
         prior_gradient, prior_curvature = self.population(common, local)
         gradients, hessians, mixed = [], [], []
-        for number, each in enumerate(modes.of_group):
+        for number, (part, each) in enumerate(zip(self.parts, modes.of_group, strict=True)):
             sd = np.sqrt(np.diagonal(each.covariance[0]))
-            gradient, hessian, cross = self.alone.expand(number, local[number], common, sd)
+            gradient, hessian, cross = self.alone.expand(part, local[number], common, sd)
             values, vectors = np.linalg.eigh(hessian - np.diag(prior_curvature[number]))
             gradients.append(gradient - prior_gradient[number])
             hessians.append((vectors * np.maximum(values, 0.0)) @ vectors.T)
             # Derivatives by hyperparameters belong to the population.
             mixed.append(cross * modes.movable)
         arrays = (common, factor, local, *map(np.stack, (gradients, hessians, mixed)))
-        point = ExpansionPoint(*(jnp.asarray(x, self.dtype) for x in arrays))
-        given = ReparamInputs(point, self.data)
+        given = ReparamInputs(*(jnp.asarray(x, self.dtype) for x in arrays), self.data)
         return given, NumpyPotential(self.reparam.value_and_gradient, given, self.dtype)
 
     def group_modes(self, key: Array) -> GroupModes:
@@ -477,12 +408,7 @@ class _Fit:
         def from_draws(number: int) -> Starts:
             return drawn[:starts, groups.local[number]], drawn[:starts, groups.common]
 
-        own = self.alone.find_modes(
-            from_draws,
-            common,
-            movable,
-            lambda done: self.progress("searching for modes", 0.8 * done),
-        )
+        own = self.find_modes(from_draws, common, movable, (0.0, 0.8))
         common[movable] = _weighted_medians(
             np.stack([each.z[0, size:] for each in own]),
             np.stack([np.diagonal(each.covariance[0])[size:] for each in own]),
@@ -493,13 +419,34 @@ class _Fit:
             local = np.concatenate([own[number].z[:, :size].astype(fresh.dtype), fresh])
             return local, np.tile(common, (len(local), 1))
 
-        shared = self.alone.find_modes(
-            from_modes,
-            common,
-            np.zeros(common.size, bool),
-            lambda done: self.progress("searching for modes", 0.8 + 0.2 * done),
-        )
+        shared = self.find_modes(from_modes, common, np.zeros(common.size, bool), (0.8, 0.2))
         return GroupModes(common, movable, shared, starts, sum(each.failures for each in own))
+
+    def find_modes(
+        self,
+        starts: Callable[[int], Starts],
+        common: np.ndarray,
+        movable: np.ndarray,
+        stage: tuple[float, float],
+    ) -> list[Modes]:
+        """The modes of every group; the stage is where progress begins, and how far it goes."""
+        axis, program = self.reparam.groups.axis, self.alone.program
+
+        def of_group(number: int) -> Modes:
+            # A thread starts with the settings of the process, not with those of this fit.
+            with jax.enable_x64(self.dtype == jnp.float64):
+                where, part = f"fit: {axis} {number}", self.parts[number]
+                return self.alone.find_modes(part, where, starts(number), common, movable)
+
+        # Compiled before the threads start: only this thread knows the deadline.
+        program.value_and_gradient.program(jnp.zeros(program.size, self.dtype), self.parts[0])
+        found: list[Modes] = []
+        with ignore_line_search_warnings(), ThreadPoolExecutor(THREADS) as pool:
+            for modes in pool.map(of_group, range(len(self.parts))):
+                found.append(modes)
+                done = stage[0] + stage[1] * len(found) / len(self.parts)
+                self.progress("searching for modes", done)
+        return found
 
     def population(self, common: np.ndarray, local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gradient and curvature of minus the log prior of the groups, each (group, local)."""

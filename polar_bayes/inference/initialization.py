@@ -23,12 +23,12 @@ from numpyro.infer.autoguide import AutoLaplaceApproximation
 from polar_bayes.errors import FitError
 from polar_bayes.inference.conditional_reparam import ConditionalReparam, find_coefficients
 from polar_bayes.inference.hierarchical_reparam import (
-    FittedReparam,
     GroupModel,
     HierarchicalReparam,
+    ReparamInputs,
+    ReparamSearch,
     find_group_model,
     find_groups,
-    fit_reparam,
 )
 from polar_bayes.inference.program import (
     BLOCK,
@@ -261,28 +261,48 @@ class JointInit(AbstractInit):
 class HierarchicalInit(AbstractInit):
     """Many groups: coordinates in which the posterior is close to standard normal."""
 
-    fitted: FittedReparam
+    reparam: HierarchicalReparam
+    given: ReparamInputs
+    potential: ValueAndGradient
+    modes: list[Modes]
     metadata: Provenance
 
     @override
     def target(self, key: Array, chains: int) -> Target:
-        size, dtype = self.fitted.reparam.size, self.fitted.given.point.common.dtype
+        size, dtype = self.reparam.size, self.given.common.dtype
         few = size <= LARGEST_DENSE
         return Target(
-            density=self.fitted.reparam.potential_jit,
-            given=self.fitted.given,
-            potential=self.fitted.potential,
-            starts=self.fitted.draw_starts(key, chains),
+            density=self.reparam.potential_jit,
+            given=self.given,
+            potential=self.potential,
+            starts=self._draw_starts(key, chains),
             metric=np.eye(size, dtype=dtype) if few else np.ones(size, dtype),
             transform=self._to_program,
             acceptance=0.98 if few else 0.7,
             warmup=300 if few else 150,
         )
 
+    def _draw_starts(self, key: Array, chains: int) -> np.ndarray:
+        """Starting points in w: each group at one of its modes, drawn by weight."""
+        random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        reparam, dtype = self.reparam, self.given.common.dtype
+        starts = []
+        for _ in range(chains):
+            w = random.normal(size=reparam.size)
+            z = np.array(reparam.forward_jit(jnp.asarray(w, dtype), self.given))
+            for positions, modes in zip(reparam.groups.local, self.modes, strict=True):
+                which = random.choice(len(modes.weight), p=modes.weight)
+                if which:
+                    z[positions] = modes.z[which]
+            start = np.asarray(reparam.inverse_jit(jnp.asarray(z, dtype), self.given), float)
+            usable = np.isfinite(start).all() and np.isfinite(self.potential(start)[0])
+            starts.append(start if usable else np.zeros_like(start))
+        return np.stack(starts)
+
     @override
     def laplace(self, key: Array, chains: int, draws: int) -> Draws:
-        noise = np.asarray(jax.random.normal(key, (chains, draws, self.fitted.reparam.size)))
-        return self._to_program(noise), _weigh(self.fitted.potential, noise, noise)
+        noise = np.asarray(jax.random.normal(key, (chains, draws, self.reparam.size)))
+        return self._to_program(noise), _weigh(self.potential, noise, noise)
 
     @override
     def joint_coordinates(self, where: str) -> Coordinates:
@@ -305,7 +325,7 @@ class HierarchicalInit(AbstractInit):
         return 0.0  # chains start from modes of each group that are drawn by weight
 
     def _to_program(self, w: np.ndarray) -> np.ndarray:
-        return np.asarray(self.fitted.reparam.forward_chains(jnp.asarray(w), self.fitted.given))
+        return np.asarray(self.reparam.forward_chains(jnp.asarray(w), self.given))
 
 
 def _weigh(potential: ValueAndGradient, z: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
@@ -321,7 +341,7 @@ def _weigh(potential: ValueAndGradient, z: np.ndarray, noise: np.ndarray) -> dic
 class AbstractInitializer(abc.ABC):
     """The search for modes in all captures of one layout."""
 
-    is_joint: ClassVar[bool]
+    is_joint: ClassVar[bool] = False
     """Whether all coordinates are optimized together, as those of pixels are."""
 
     @property
@@ -337,12 +357,13 @@ class AbstractInitializer(abc.ABC):
         """Begin to compile what `find` needs; nothing by default."""
         del data
 
-    @abc.abstractmethod
     def prepare_target(self, data: Observations) -> Target | None:
         """A target of the shapes that the search will give, whose programs begin to compile.
 
-        None where the shapes are not known.
+        None where the shapes are not known, as by default.
         """
+        del data
+        return None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -406,23 +427,17 @@ class HierarchicalInitializer(AbstractInitializer):
     group_model: GroupModel
     reparam: HierarchicalReparam
 
-    is_joint: ClassVar[bool] = False
-
     @override
     def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:
-        fitted = fit_reparam(self.group_model, self.reparam, data, key, progress)
-        modes = fitted.modes
+        search = ReparamSearch(self.group_model, self.reparam, data, progress)
+        given, potential, modes = search.run(key)
         metadata = {
             "starts": modes.starts * self.reparam.groups.count,
             "failures": modes.failures,
             "patches_with_several": sum(len(each.weight) > 1 for each in modes.of_group),
-            "newton_decrement": fitted.decrement,
+            "newton_decrement": float(np.linalg.norm(potential(np.zeros(self.reparam.size))[1])),
         }
-        return HierarchicalInit(fitted, metadata)
-
-    @override
-    def prepare_target(self, data: Observations) -> None:
-        return None
+        return HierarchicalInit(self.reparam, given, potential, modes.of_group, metadata)
 
 
 def make_initializer(model: Model, program: Program, data: Observations) -> AbstractInitializer:

@@ -4,6 +4,7 @@ Methods use sites and shapes, never a parameter by name. The data are an argumen
 so that fits to captures of one layout share their compiled programs.
 """
 
+import abc
 import contextlib
 import dataclasses
 import functools
@@ -57,8 +58,26 @@ class Draw(NamedTuple):
     log_density: Array | np.ndarray
 
 
+class AbstractDensity[Given](abc.ABC):
+    """A log density of flat vectors, with what is compiled of it for all captures of a layout."""
+
+    @abc.abstractmethod
+    def potential(self, z: Float[Array, " size"], given: Given) -> Float[Array, ""]:
+        """Minus the log density of a vector, up to a constant."""
+
+    @functools.cached_property
+    def potential_jit(self) -> Callable[[Array, Given], Array]:
+        """The potential; the model is traced once, however many programs compute it."""
+        return jax.jit(self.potential, inline=True)
+
+    @functools.cached_property
+    def value_and_gradient(self) -> JitOnce:
+        """The potential with its gradient, compiled."""
+        return JitOnce(jax.value_and_grad(self.potential_jit))
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
-class Program:
+class Program(AbstractDensity[Observations]):
     """A model conditioned on data of one layout; `prior` is the model without its readings."""
 
     model: Model
@@ -75,12 +94,12 @@ class Program:
     size: int
     unravel: Callable[[Float[Array, " size"]], dict[str, Array]]
 
+    @override
     def potential(self, z: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
-        """Minus the log posterior density of the unconstrained vector, up to a constant."""
         return self.potential_at(self.unravel(z), data)
 
     def potential_at(self, sites: dict[str, Array], data: Observations) -> Float[Array, ""]:
-        """The same of the unconstrained latent sites by name."""
+        """Minus the log posterior density of the unconstrained latent sites by name."""
         return -_total(self._log_terms(self.model, sites, data)[0], data)
 
     def prior_potential(self, z: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
@@ -223,16 +242,6 @@ class Program:
             name: jnp.where(data.valid, trace[name]["value"] - noise_free(trace, name), 0.0)
             for name in self.observed
         }
-
-    @functools.cached_property
-    def potential_jit(self) -> Callable[[Array, Observations], Array]:
-        """The potential; the model is traced once, however many programs compute it."""
-        return jax.jit(self.potential, inline=True)
-
-    @functools.cached_property
-    def value_and_gradient(self) -> JitOnce:
-        """The potential with its gradient, compiled."""
-        return JitOnce(jax.value_and_grad(self.potential_jit))
 
     @functools.cached_property
     def drawn_from_prior(self) -> JitOnce:
