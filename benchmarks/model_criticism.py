@@ -365,7 +365,8 @@ def wrong(fits: int, *, readings: int = READINGS, chosen: bool = False) -> Any:
 
 def _wrong(world: World, readings: int, seed: int, *, chosen: bool) -> dict[str, Any]:
     capture = world.capture(readings, seed).assign_attrs(setup=world.setup)
-    truth = {n: float(capture[f"true_{n}"]) for n in MATERIAL if f"true_{n}" in capture}
+    found = {n: capture.get(f"true_{n}") for n in MATERIAL}
+    truth = {n: x.to_numpy().ravel()[0] for n, x in found.items() if x is not None}
     scene = "auto" if chosen else world.setup
     return judge(capture, truth, scene=scene, method=world.method, seed=seed)
 

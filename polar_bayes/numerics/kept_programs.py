@@ -95,7 +95,9 @@ def _environment() -> str:
     """What all programs of a process depend on, as one word."""
     models = find_spec("polar_bayes.models")
     roots = {Path(__file__).parents[1], *map(Path, models.submodule_search_locations or ())}
-    sources = sorted(path for root in roots for path in root.rglob("*.*") if path.suffix in (".py", ".csv"))
+    sources = sorted(
+        path for root in roots for path in root.rglob("*.*") if path.suffix in (".py", ".csv")
+    )
     settings = {n: x for n, x in jax.config.values.items() if "cache" not in n and "log" not in n}
     processor = Path("/proc/cpuinfo")
     lines = processor.read_text().splitlines() if processor.is_file() else [platform.processor()]
@@ -107,7 +109,9 @@ def _environment() -> str:
             os.environ.get("XLA_FLAGS", ""),
             platform.machine(),
             platform.python_version(),
-            *sorted({line for line in lines if line.startswith(("flags", "Features", "model name"))}),
+            *sorted(
+                {line for line in lines if line.startswith(("flags", "Features", "model name"))}
+            ),
         ]
     )
 
