@@ -62,7 +62,7 @@ def _judged(
     _, draws = labeled(problem, draws_of_auto.z)
     flat, reference = (x.reshape(len(x), -1) for x in (draws, reference_run.draws))
     apart = distances(flat, reference)
-    error = float(np.max(np.abs([apart.mean_error, apart.sd_error])))
+    error = float(np.max(np.abs([apart["mean_error"], apart["sd_error"]])))
     return {
         "error": error,
         "seconds": seconds,

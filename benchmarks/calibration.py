@@ -47,7 +47,7 @@ def by_loop(capture: xr.Dataset, count: int) -> Iterator[tuple[float, float]]:
     with jax.enable_x64(True):
         request = resolve(capture, "per_material", SCENE, None, None, None, 0, "double")
         data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
-        model = request.bind(SCENE)
+        model = request.bind()
         program = compile_program(model, data)
         drawn = draw_captures(program, data, np.arange(count), jax.random.key(1))
         chain = MCMC(NUTS(model), progress_bar=False, **LENGTHS)
@@ -66,7 +66,7 @@ def by_simuk(capture: xr.Dataset, count: int) -> float:
     with jax.enable_x64(True):
         request = resolve(capture, "per_material", SCENE, None, None, None, 0, "double")
         data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
-        model = request.bind(SCENE)
+        model = request.bind()
 
         def story(dop: Any = None, intensity: Any = None) -> None:
             if dop is None:

@@ -78,13 +78,15 @@ def gradients(scenes: list[pb.Scene], data: xr.Dataset) -> list[tuple[float, flo
     for scene in scenes:
         request = resolve(data, "per_material", scene, None, None, None, 0, "double")
         readings = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
-        program = compile_program(request.bind(scene), readings)
+        program = compile_program(request.bind(), readings)
         z = np.zeros(program.size)
         compiled.append(compile_and_count(jax.value_and_grad(program.potential), z, readings))
-        calls.append(lambda call=compiled[-1].call, z=z, readings=readings: call(z, readings))
+        calls.append(lambda call=compiled[-1][0], z=z, readings=readings: call(z, readings))
     return [
-        (one.operations, one.compile_seconds, seconds)
-        for one, seconds in zip(compiled, run_seconds(calls), strict=True)
+        (operations, compile_seconds, seconds)
+        for (_, operations, compile_seconds), seconds in zip(
+            compiled, run_seconds(calls), strict=True
+        )
     ]
 
 

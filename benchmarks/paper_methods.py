@@ -13,7 +13,6 @@ from jaxtyping import Array
 from paper_study import (
     NAMES,
     PAPER,
-    SCENE,
     NormalScores,
     Population,
     Study,
@@ -71,8 +70,8 @@ class LeastSquares:
         )
         with jax.enable_x64(True):
             data = observe(fitted.capture)
-            self.program = compile_program(fitted.bind(SCENE), data)
-            story = compile_program(generative_program.bind(SCENE), data)
+            self.program = compile_program(fitted.bind(), data)
+            story = compile_program(generative_program.bind(), data)
             key = jax.random.key(study.seed)
             # The captures that `calibrate` draws for this seed.
             numbers, own = np.arange(study.simulations), jax.random.fold_in(key, 1)

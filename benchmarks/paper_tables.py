@@ -16,7 +16,6 @@ from paper_study import (
     LARGEST,
     NAMES,
     PAPER,
-    SCENE,
     Figure,
     NormalScores,
     Population,
@@ -126,7 +125,7 @@ class Information:
                 "double",
             )
             self.data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
-            self.program = compile_program(request.bind(SCENE), self.data)
+            self.program = compile_program(request.bind(), self.data)
         self._run = jax.jit(
             lambda z: jax.lax.map(lambda each: _at(self.program, each, self.data), z)
         )

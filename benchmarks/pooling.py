@@ -102,19 +102,19 @@ def gradient() -> None:
         request = resolve(capture, "hierarchical", None, None, None, None, 0, "double")
         with jax.enable_x64(True):
             data = observe(request.capture)
-            program = compile_program(request.bind(request.scene), data)
+            program = compile_program(request.bind(), data)
             groups = find_groups(program, data)
             assert groups is not None
             transport = HierarchicalReparam(program, groups)
             local, common = groups.local.shape, groups.common.size
             given = ReparamInputs(
+                data,
                 jnp.zeros(common),
                 jnp.eye(common),
                 jnp.zeros(local),
                 jnp.zeros(local),
                 jnp.broadcast_to(jnp.eye(local[1]), (*local, local[1])),
                 jnp.zeros((*local, common)),
-                data,
             )
             w = jnp.zeros(program.size)
             both = jax.jit(jax.value_and_grad(transport.potential))

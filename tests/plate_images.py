@@ -8,7 +8,8 @@ from scipy import stats
 from textbook import plate_q
 
 import polar_bayes as pb
-from polar_bayes.inference.batching import ObservationBatch, cut
+from polar_bayes.inference.batching import cut
+from polar_bayes.inference.problem_batch import ProblemBatch
 from polar_bayes.maps.fit_map import (
     MapPlan,
     blank,
@@ -79,9 +80,9 @@ def planned(capture, method=None, *, seed=0, precision="double", **asked):
     return estimate_plan(asked_for, capture)
 
 
-def stacked(capture: xr.Dataset, plan: MapPlan) -> ObservationBatch:
+def stacked(capture: xr.Dataset, plan: MapPlan) -> ProblemBatch:
     """The pixels of an image in a row."""
-    return plan.pixels(mask_missing(capture))
+    return plan.batch(mask_missing(capture))
 
 
 def mapped(capture: xr.Dataset, plan: MapPlan, block: int = 4096) -> xr.Dataset:

@@ -95,7 +95,7 @@ def rehearse(capture: xr.Dataset, asked: dict[str, object]) -> None:
     wanted = list(inspect.signature(resolve).parameters)
     request = resolve(**{n: options.arguments[n] for n in wanted if n in options.arguments})
     data = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
-    program = compile_program(request.bind(request.scene), data)
+    program = compile_program(request.bind(), data)
     assert jax.eval_shape(program.potential, np.zeros(program.size), data).shape == ()
 
 

@@ -42,7 +42,7 @@ class Posterior:
     @functools.cached_property
     def model(self) -> Callable[[Observations], None]:
         """The NumPyro model."""
-        return self.request.bind(SCENE)
+        return self.request.bind()
 
     @functools.cached_property
     def program(self) -> Program:

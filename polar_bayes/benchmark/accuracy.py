@@ -11,7 +11,7 @@ from numpyro import distributions as dist
 
 from polar_bayes.benchmark.advice import AS_GIVEN
 from polar_bayes.benchmark.reference import (
-    Distances,
+    DISTANCES,
     Reference,
     ReferenceRun,
     distances,
@@ -175,7 +175,7 @@ def _trials(
 def _row(trial: Trial | PolarBayesError, reference: ReferenceRun, *, fresh: bool) -> dict[str, Any]:
     """Distances, diagnostics and costs of one trial by name; NaN where it failed."""
     row: dict[str, Any] = {
-        **{name: np.full(len(reference.labels), np.nan) for name in Distances._fields},
+        **{name: np.full(len(reference.labels), np.nan) for name in DISTANCES},
         **dict.fromkeys((*DIAGNOSTICS, "seconds_again", *COSTS_OF_PROCESS), np.nan),
     }
     try:
@@ -188,7 +188,7 @@ def _row(trial: Trial | PolarBayesError, reference: ReferenceRun, *, fresh: bool
     draws, expected = (
         x.reshape(shared.size, -1) for x in (found.draws[ours], reference.draws[theirs])
     )
-    for name, values in distances(draws, expected)._asdict().items():
+    for name, values in distances(draws, expected).items():
         row[name][theirs] = values
     costs = ("seconds_again", *(COSTS_OF_PROCESS if fresh else ()))
     row |= {name: getattr(found.posterior, name) for name in DIAGNOSTICS}
@@ -204,7 +204,7 @@ def _dataset(
         name: ("row", np.array([row[name] for row in rows], float))
         for name in (*DIAGNOSTICS, "seconds_again", *COSTS_OF_PROCESS)
     }
-    for name in Distances._fields:
+    for name in DISTANCES:
         columns[name] = ("row", "parameter"), np.stack([row[name] for row in rows])
     columns["problems"] = ("row", np.array([row["problems"] for row in rows], object))
     columns |= {

@@ -14,30 +14,23 @@ from polar_bayes.benchmark.run import labeled
 from polar_bayes.errors import FitError
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.result import CENTRAL_95
+from polar_bayes.methods.auto import bias_doubts
 from polar_bayes.methods.importance import Importance
 from polar_bayes.methods.method import AbstractMethod, PosteriorDraws
 from polar_bayes.methods.nuts import Nuts
-from polar_bayes.numerics.mcse import LARGEST_R_HAT
 from polar_bayes.progress import no_progress
 
 # --- Distances from the reference -----------------------------------------------------------------
 
 
-class Distances(NamedTuple):
-    """Of every parameter, in standard deviations of the reference, each (parameter,)."""
-
-    mean_error: Float[np.ndarray, " parameter"]
-    sd_error: Float[np.ndarray, " parameter"]
-    low_error: Float[np.ndarray, " parameter"]
-    high_error: Float[np.ndarray, " parameter"]
-    wasserstein: Float[np.ndarray, " parameter"]
+DISTANCES = ("mean_error", "sd_error", "low_error", "high_error", "wasserstein")
 
 
 def distances(
     draws: Float[np.ndarray, "parameter draw"], reference: Float[np.ndarray, "parameter many"]
-) -> Distances:
-    """Compare draws with those of a reference."""
-    found = np.full((len(Distances._fields), len(draws)), np.inf)
+) -> dict[str, Float[np.ndarray, " parameter"]]:
+    """`DISTANCES` of every parameter from a reference, in standard deviations of that."""
+    found = np.full((len(DISTANCES), len(draws)), np.inf)
     for at in np.flatnonzero(np.isfinite(draws).all(axis=1)):
         ours, theirs = draws[at], reference[at]
         unit = theirs.std()
@@ -45,7 +38,7 @@ def distances(
         wasserstein = scipy.stats.wasserstein_distance(ours, theirs)
         mean, sd = ours.mean() - theirs.mean(), ours.std() - unit
         found[:, at] = np.array([mean, sd, low, high, wasserstein]) / unit
-    return Distances(*found)
+    return dict(zip(DISTANCES, found, strict=True))
 
 
 # --- The reference --------------------------------------------------------------------------------
@@ -163,14 +156,8 @@ def _run(
     first, second = (
         half.reshape(len(draws), -1) for half in np.split(draws, [draws.shape[1] // 2], axis=1)
     )
-    biases = found.doubts
-    if found.r_hat > LARGEST_R_HAT:
-        biases.append(f"its R-hat is {found.r_hat:.3f}")
-    if found.method == "nuts" and (
-        (weight := problem.initialize().missed_mode_weight(found.z)) > 0.0
-    ):
-        biases.append(f"a mode of weight {weight:.2g} was not visited by every chain")
-    apart = distances(first, second).wasserstein
+    biases = bias_doubts(found, problem)
+    apart = distances(first, second)["wasserstein"]
     run = ReferenceRun(labels, draws, name, mean_error, sd_error, apart, found, tuple(biases))
     if run.error <= settings.error:
         return run

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 
 from polar_bayes.diagnostics.parameters import scalars
 from polar_bayes.errors import FitError, PolarBayesError
-from polar_bayes.inference.cache_key import cache_key
+from polar_bayes.inference.model_parts import ModelParts
 from polar_bayes.inference.problem import Problem, make_problem
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import posterior_of
@@ -213,21 +213,6 @@ class _Factor(AbstractOverride):
         return f"{self.what} / {1.0 / self.factor:g}"
 
 
-class _SceneOverride(AbstractOverride):
-    """Another scene."""
-
-    @abc.abstractmethod
-    def scene(self, request: Request) -> Scene:
-        """The scene that is fitted in place of the request's."""
-
-    @override
-    def apply(self, request: Request, method: AbstractMethod) -> Trial | None:
-        scene = self.scene(request)
-        if scene == request.scene:
-            return None
-        return Trial(dataclasses.replace(request, scene=scene), method)
-
-
 @dataclasses.dataclass(frozen=True)
 class DrawsOverride(_Factor):
     """So many times the draws; left out where a method cannot have about as many.
@@ -272,7 +257,7 @@ class PrecisionOverride(AbstractOverride):
 
 
 @dataclasses.dataclass(frozen=True)
-class FacetsOverride(_Factor, _SceneOverride):
+class FacetsOverride(_Factor):
     """So many times the facets in each direction.
 
     Args:
@@ -285,13 +270,13 @@ class FacetsOverride(_Factor, _SceneOverride):
     what: ClassVar[str] = "facets"
 
     @override
-    def scene(self, request: Request) -> Scene:
+    def apply(self, request: Request, method: AbstractMethod) -> Trial | None:
         changed = [
             Effect("", key_path, part, self._of(part))
             for key_path, part in parts_of(request.scene)
             if isinstance(part, FacetQuadrature)
         ]
-        return simplify(request.scene, changed)
+        return _with_scene(simplify(request.scene, changed), request, method)
 
     def _of(self, rule: FacetQuadrature) -> FacetQuadrature:
         along, across = (
@@ -301,7 +286,7 @@ class FacetsOverride(_Factor, _SceneOverride):
 
 
 @dataclasses.dataclass(frozen=True)
-class EffectsOverride(_SceneOverride):
+class EffectsOverride(AbstractOverride):
     """Only the effects that `polar_bayes.choose_effects` keeps.
 
     Args:
@@ -316,11 +301,18 @@ class EffectsOverride(_SceneOverride):
         return "chosen effects"
 
     @override
-    def scene(self, request: Request) -> Scene:
+    def apply(self, request: Request, method: AbstractMethod) -> Trial | None:
         scene = _choose(request, self.tolerance)
         if isinstance(scene, PolarBayesError):
             raise scene
-        return scene
+        return _with_scene(scene, request, method)
+
+
+def _with_scene(scene: Scene, request: Request, method: AbstractMethod) -> Trial | None:
+    """A trial with another scene; None where it is that of the request."""
+    if scene == request.scene:
+        return None
+    return Trial(dataclasses.replace(request, scene=scene), method)
 
 
 OVERRIDES: tuple[AbstractOverride, ...] = (
@@ -343,7 +335,8 @@ def _choose(request: Request, tolerance: float) -> Scene | PolarBayesError:
     swapped = (name.rpartition("prior of ") for name in request.swapped)  # by the user
     priors = {name: request.priors[name] for _, found, name in swapped if found}
     limits = tolerance, request.largest_view_zenith, request.seed
-    key = cache_key(request.model, plain, priors, request.links, request.capture, *limits)
+    parts = ModelParts(request.model, plain, priors, request.links)
+    key = parts.key(request.capture, *limits)
 
     def choose() -> Scene | PolarBayesError:
         try:

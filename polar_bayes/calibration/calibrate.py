@@ -108,7 +108,8 @@ def calibrate(
     start = time.perf_counter()
     _check_size(simulations, store, resume)
     asked = {"model": model, "scene": scene, "priors": priors, "links": links}
-    requests = _requests(capture, asked, truth or {}, largest_view_zenith, seed)
+    limits = {"largest_view_zenith": largest_view_zenith, "seed": seed, "precision": "double"}
+    requests = _requests(capture, asked, truth or {}, limits)
     settings = find_method(FIT_DEFAULT if method is None else method, "calibrate", many=True)
     plan = make_plan(*requests, settings, readings)
     forecast, folder = Forecast(plan), None if store is None else as_path(store, "store")
@@ -131,22 +132,14 @@ def _check_size(simulations: int, store: object, resume: bool) -> None:
 
 
 def _requests(
-    capture: xr.Dataset,
-    asked: dict[str, Any],
-    truth: Mapping[str, Any],
-    largest_view_zenith: float | None,
-    seed: int,
+    capture: xr.Dataset, asked: dict[str, Any], truth: Mapping[str, Any], limits: dict[str, Any]
 ) -> tuple[Request, Request | None]:
     """That of the fits, and that of the data where they are simulated by another."""
     if unknown := set(truth) - set(asked):
         what = f"{', '.join(sorted(unknown))} cannot differ"
         raise FitError(what, where="calibrate: truth", hint=f"give some of {', '.join(asked)}")
-
-    def resolved(arguments: dict[str, Any]) -> Request:
-        model, scene, priors, links = arguments.values()
-        return resolve(capture, model, scene, priors, links, largest_view_zenith, seed, "double")
-
-    return resolved(asked), resolved({**asked, **truth}) if truth else None
+    fitted = resolve(capture, **asked, **limits)
+    return fitted, resolve(capture, **{**asked, **truth}, **limits) if truth else None
 
 
 def _provenance(

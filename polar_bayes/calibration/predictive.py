@@ -23,8 +23,9 @@ from jaxtyping import Array
 from numpyro import handlers
 
 from polar_bayes.calibration.scores import randomized_pit
-from polar_bayes.inference.batching import ObservationBatch, batched
-from polar_bayes.inference.compiled_model import SMALL_BATCH, CompiledModel
+from polar_bayes.inference.batching import batched
+from polar_bayes.inference.compiled_model import CompiledModel
+from polar_bayes.inference.problem_batch import SMALL_BATCH, ProblemBatch
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.numerics.psis import draws_at, smooth
@@ -42,25 +43,18 @@ DRAW_BATCH = 32
 class PredictivePit:
     """PIT values of readings, filled in fit by fit; NaN where a fit has failed."""
 
-    def __init__(
-        self,
-        engine: CompiledModel,
-        captures: ObservationBatch,
-        replicated: Values,
-        numbers: np.ndarray,
-        seed: int,
-    ) -> None:
-        self._engine, self._captures = engine, captures
+    def __init__(self, batch: ProblemBatch, replicated: Values, numbers: np.ndarray) -> None:
+        self._batch, seed = batch, batch.seed
         self._names = tuple(sorted(replicated))
         count = len(numbers)
-        valid = np.asarray(captures.batched.valid).reshape(count, -1)
+        valid = np.asarray(batch.pixels.batched.valid).reshape(count, -1)
         uniform = np.array(
             [np.random.default_rng([seed, n, 1]).random(1 + 3 * len(replicated)) for n in numbers]
         )
         self._first, uniform = uniform[:, 0], uniform[:, 1:].reshape(count, 3, -1)
         self.entry = {n: _choose(valid, uniform[:, 0, at]) for at, n in enumerate(self._names)}
         self._uniform = {n: uniform[:, 1:, at] for at, n in enumerate(self._names)}
-        fitted = self._captures.batched.readings
+        fitted = batch.pixels.batched.readings
         self._observed = {
             n: np.stack([_take(x[n], self.entry[n]) for x in (replicated, fitted)], axis=-1)
             for n in self._names
@@ -80,7 +74,7 @@ class PredictivePit:
         rows = np.arange(at.size)[:, None]
         latent = {
             name: np.asarray(parameters[name], np.float32)[rows, chosen]
-            for name in self._engine.program.supports
+            for name in self._batch.engine.program.supports
         }
         predicted, log_likelihood = self._predict(at, latent)
         equal = np.full((at.size, DRAWS), 1.0 / DRAWS)
@@ -104,10 +98,8 @@ class PredictivePit:
         """Predictions of the chosen entries and their log likelihoods: by name, (fit, draw)."""
         entry = {name: np.maximum(x[at], 0).astype(np.int32) for name, x in self.entry.items()}
         states = (entry, latent, self._keys[at])
-        captures, names = self._captures.subset(at), self._names
-        return self._engine.run(
-            _predictor, names, captures, *states, batch=SMALL_BATCH, single=True
-        )
+        some = self._batch.subset(at)
+        return some.run(_predictor, self._names, *states, batch=SMALL_BATCH, single=True)
 
 
 def unranked_reason(

@@ -16,18 +16,6 @@ from polar_bayes.errors import FitError
 
 MAX_DRAWS = 4000
 SEED = 31
-COLUMNS = (
-    "repeats",
-    "failed",
-    "mean",
-    "scatter",
-    "expected",
-    "ratio",
-    "chi_square",
-    "p_value",
-    "pairs",
-    "agreeing",
-)
 
 
 def retest(results: Sequence[xr.DataTree]) -> pd.DataFrame:
@@ -67,8 +55,9 @@ def retest(results: Sequence[xr.DataTree]) -> pd.DataFrame:
     if not common:
         hint = "give fits of the same model to captures of the same layout"
         raise FitError("these fits share no parameter", where="retest", hint=hint)
+    columns = "repeats failed mean scatter expected ratio chi_square p_value pairs agreeing".split()
     rows = {label: _compare([each[label].draws.ravel() for each in found]) for label in common}
-    table = pd.DataFrame.from_dict(rows, orient="index").reindex(columns=list(COLUMNS))
+    table = pd.DataFrame.from_dict(rows, orient="index").reindex(columns=columns)
     level = significance_level(table)
     table["conclusion"] = [_conclusion(row, level) for _, row in table.iterrows()]
     return table

@@ -12,7 +12,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,7 +25,7 @@ from polar_bayes.errors import FitError, OutputError, PolarBayesError
 from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status
 from polar_bayes.inference.compiled_model import CompiledModel, compile_layout
 from polar_bayes.inference.problem import observe_request
-from polar_bayes.inference.problem_batch import empty_outcome, problem_batch
+from polar_bayes.inference.problem_batch import Outcome, problem_batch
 from polar_bayes.inference.program import Program, Values, compile_program
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import dims_of, shape_of
@@ -88,24 +87,19 @@ class CompiledPlan:
         plan = self.plan
         return compile_layout(plan.layout_key, plan.request, lambda: self.data)
 
-    @property
-    def program(self) -> Program:
-        """The model that is fitted."""
-        return self.engine.program
-
     @functools.cached_property
     def generative_program(self) -> Program:
         """The model by which captures are simulated."""
         request = self.plan.generative_request
         if request is None:
-            return self.program
+            return self.engine.program
         with jax.enable_x64(True), TRACING_LOCK:
-            return compile_program(request.bind(request.scene), self.data)
+            return compile_program(request.bind(), self.data)
 
     @functools.cached_property
     def shared(self) -> dict[str, tuple[int, ...]]:
         """Shapes of the parameters that are both simulated and fitted, by name."""
-        fitted = _shapes(self.program, self.data)
+        fitted = _shapes(self.engine.program, self.data)
         simulated = _shapes(self.generative_program, self.data)
         return {name: shape for name, shape in simulated.items() if fitted.get(name) == shape}
 
@@ -114,7 +108,7 @@ class CompiledPlan:
         """Why readings cannot be ranked; empty where they can, or where none are to be."""
         if not self.plan.readings:
             return ""
-        program, given = self.program, _shapes(self.program, self.data)
+        program, given = self.engine.program, _shapes(self.engine.program, self.data)
         with jax.enable_x64(True), TRACING_LOCK:
             return unranked_reason(program, self.generative_program, self.data, given)
 
@@ -132,23 +126,23 @@ def fit_block(plan: CalibrationPlan, numbers: np.ndarray) -> xr.DataTree:
     with jax.enable_x64(True):
         key = jax.random.fold_in(jax.random.key(seed), 1)
         drawn = draw_captures(program, data, filled, key, replicate=is_ranked)
-    engine = compiled.engine
     truth: Arrays = {name: np.asarray(drawn.truth[name])[:count] for name in shared}
     captures = drawn.captures.subset(np.arange(count))
+    batch = problem_batch(compiled.engine, captures, numbers, seed)
     marginals, scores = Marginals(count, shared, random=True), PitCrps(truth, numbers, seed)
     ranked = None
     if is_ranked:
         again = {name: np.asarray(values)[:count] for name, values in drawn.replicated.items()}
-        ranked = PredictivePit(engine, captures, again, numbers, seed)
+        ranked = PredictivePit(batch, again, numbers)
     statistics: list[Marginals | PitCrps | PredictivePit] = [marginals, scores]
     statistics += [ranked] if ranked else []
-    outcome = empty_outcome(count)
-    for found in plan.settings.fit_batch(problem_batch(engine, captures, numbers, seed)):
+    outcome = Outcome(count)
+    for found in plan.settings.fit_batch(batch):
         outcome.put(found)
         for statistic in statistics if found.draws else ():
             statistic.describe(found.at, found.draws, found.weights)
     groups = _label_groups(compiled, numbers, truth, scores, marginals)
-    fits: dict[str, tuple] = {name: ("simulation", x) for name, x in outcome._asdict().items()}
+    fits: dict[str, tuple] = {name: ("simulation", x) for name, x in vars(outcome).items()}
     for name, flags in {"status": Status, "method": MethodUsed}.items():
         meanings = " ".join(flag.name.lower() for flag in flags)
         fits[name] = (*fits[name], {"flag_meanings": meanings})
@@ -166,7 +160,7 @@ def _label_groups(
     marginals: Marginals,
 ) -> dict[str, xr.Dataset]:
     """What is known of the parameters of some simulations, with names, axes and units."""
-    program, captured = compiled.program, compiled.plan.request.capture
+    program, captured = compiled.engine.program, compiled.plan.request.capture
     dims, lengths = dims_of(program), dict(compiled.data.dims)
     axes = {
         dim: captured[dim].to_numpy() if dim in captured.coords else np.arange(lengths[dim])
@@ -293,7 +287,7 @@ def _simulator(program: Program, replicate: bool) -> JitOnce:
     # Where intensity is recorded, each capture's own brightness sets its noise, and readings at
     # full scale are saturated.
 
-    def simulate(number: Array, key: Array, data: Observations) -> tuple[Values, tuple, Values]:
+    def simulate(number: Array, key: Array, data: Observations) -> tuple[Values, dict, Values]:
         key_truth, key_noise = jax.random.split(jax.random.fold_in(key, number))
         z = program.from_prior(key_truth, data)
         draw = program.describe(key_noise, z, data)
@@ -303,7 +297,7 @@ def _simulator(program: Program, replicate: bool) -> JitOnce:
             recorded = _recorded(data, {**others, "intensity": draw.predictive["intensity"]})
         key_again = jax.random.fold_in(key_noise, 1)
         again = program.describe(key_again, z, recorded).predictive if replicate else {}
-        drawn = recorded.readings, recorded.brightness, recorded.saturated
+        drawn = {name: getattr(recorded, name) for name in ("readings", "brightness", "saturated")}
         return draw.parameters, drawn, again
 
     return JitOnce(
@@ -324,22 +318,14 @@ def _recorded(data: Observations, readings: Mapping[str, Any]) -> Observations:
     )
 
 
-def _batch(data: Observations, recorded: tuple) -> ObservationBatch:
+def _batch(data: Observations, recorded: Mapping[str, Any]) -> ObservationBatch:
     """Captures as a batch: what was drawn and the masks differ, all else is the same."""
-
-    def drawn(capture: Observations) -> tuple:
-        return capture.readings, capture.brightness, capture.saturated, capture.valid
-
-    shape = (len(recorded[1]), *data.shape)
-    recorded = jax.tree.map(lambda x: np.broadcast_to(x, shape), recorded)
-    valid = np.broadcast_to(np.asarray(data.valid), shape)
-    plain = jax.tree.map(np.asarray, data)
-    is_drawn = eqx.tree_at(
-        drawn, jax.tree.map(lambda _: False, plain), jax.tree.map(lambda _: True, drawn(plain))
-    )
-    own, shared = eqx.partition(eqx.tree_at(drawn, plain, (*recorded, valid)), is_drawn)
-    views = valid.reshape(shape[0], -1, shape[-1]).any(axis=1).sum(axis=-1)
-    return ObservationBatch(own, shared, views)
+    own = {**recorded, "valid": data.valid}
+    shape = (len(recorded["brightness"]), *data.shape)
+    wide = jax.tree.map(lambda x: np.broadcast_to(x, shape), own)
+    arrays = dataclasses.replace(jax.tree.map(np.asarray, data), **wide)
+    nothing, drawn = jax.tree.map(lambda _: False, data), jax.tree.map(lambda _: True, own)
+    return ObservationBatch.of(arrays, dataclasses.replace(nothing, **drawn))
 
 
 # --- Blocks on the disk ---------------------------------------------------------------------------

@@ -171,24 +171,20 @@ def coverage_p_value(held: int, count: int, share: float) -> float:
     return float(scipy.stats.binomtest(held, count, share).pvalue) if count else math.nan
 
 
-class Spread(NamedTuple):
-    """Scatter of the truths in units of the posterior's width: the spread of a right one is 1."""
+def spread_of_scores(pit: Float[np.ndarray, " size"]) -> tuple[float, float]:
+    """p-value and standard deviation of normal scores of PIT values; NaN for fewer than two.
 
-    p_value: float
-    spread: float
-
-
-def spread_of_scores(pit: Float[np.ndarray, " size"]) -> Spread:
-    """Test the standard deviation of normal scores of PIT values; NaN for fewer than two."""
+    Of right posteriors it is 1: it is the scatter of the truths over the posterior's width.
+    """
     # A normal score is (truth - mean) / sd where the posterior is normal. Of any other posterior it
     # is standard normal all the same, so the test is exact, and no tail of a posterior upsets it.
     if pit.size < 2:
-        return Spread(math.nan, math.nan)
+        return math.nan, math.nan
     scores = scipy.special.ndtri(np.clip(pit, 1e-12, 1.0 - 1e-12))
     freedom = len(scores) - 1
     chi_square = freedom * float(np.var(scores, ddof=1))
     tails = scipy.stats.chi2.cdf(chi_square, freedom), scipy.stats.chi2.sf(chi_square, freedom)
-    return Spread(min(1.0, 2.0 * float(min(tails))), math.sqrt(chi_square / freedom))
+    return min(1.0, 2.0 * float(min(tails))), math.sqrt(chi_square / freedom)
 
 
 # --- Several p-values as one test -----------------------------------------------------------------

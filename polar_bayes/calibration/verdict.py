@@ -136,8 +136,7 @@ def calibration_view(calibration: xr.DataTree | CalibrationView) -> CalibrationV
 HALF = 0.5
 """Share of fits that have failed, or are not trusted, from which another method is named."""
 
-SHIFT_LIMIT = SPREAD_LIMIT = 2.5
-TAIL_LIMIT = 2.0
+MOMENT_LIMIT = 2.5
 """Standard errors from which a moment of the ranks is named as the deviation."""
 
 TOO_FEW = "fewer than two fits have an answer"
@@ -163,7 +162,7 @@ def _parameter_row(scalar: Scalar, truth: np.ndarray, marginals: xr.Dataset) -> 
     own = marginals.isel(index)
     bounds = own[f"{scalar.name}_quantile"]
     columns = _rank_columns(pit)
-    scatter = spread_of_scores(pit[np.isfinite(pit)])
+    p_spread, spread = spread_of_scores(pit[np.isfinite(pit)])
     held = {}
     for percent, levels in INTERVALS.items():
         low, high = (bounds.sel(quantile=level).to_numpy() for level in levels)
@@ -177,8 +176,8 @@ def _parameter_row(scalar: Scalar, truth: np.ndarray, marginals: xr.Dataset) -> 
         **columns,
         **coverage_columns(held, pit.size),
         **tests,
-        "p_spread": scatter.p_value,
-        "spread": scatter.spread,
+        "p_spread": p_spread,
+        "spread": spread,
         **{name: float(pd.Series(x[np.isfinite(x)]).mean()) for name, x in means.items()},
     }
 
@@ -354,14 +353,14 @@ def _deviation(row: pd.Series, expected_spread: float, location: str, width: str
     # The standard error of the spread of n uniform ranks is 1 / sqrt(5 n).
     stretch = (row["rank_spread"] - expected_spread) * math.sqrt(5.0 * count)
     found = []
-    if abs(shift) > SHIFT_LIMIT:
+    if abs(shift) > MOMENT_LIMIT:
         found.append(f"{location} too {'low' if shift > 0.0 else 'high'}")
-    if abs(stretch) > SPREAD_LIMIT:
+    if abs(stretch) > MOMENT_LIMIT:
         found.append(f"{width} are too {'narrow' if stretch > 0.0 else 'wide'}")
     if not found and "held_95" in row:
         share = row["held_95"] * (count + row["failed"]) / count
         excess = (share - 0.95) / math.sqrt(0.95 * 0.05 / count)
-        if abs(excess) > TAIL_LIMIT:
+        if abs(excess) > 2.0:
             found.append(
                 f"the tails of the posterior are too {'long' if excess > 0.0 else 'short'}"
             )

@@ -49,11 +49,8 @@ FAR_FROM_MARGIN, MARGIN_NODES = 4.0, 128
 readings between the margins over which the information is averaged elsewhere."""
 
 
-class FisherInformation(NamedTuple):
-    """A distribution's parameters, and the information of one reading about them."""
-
-    parameters: tuple[Float[Array, "..."], ...]
-    information: Float[Array, "... parameter parameter"]
+FisherInformation = tuple[tuple[Array, ...], Array]
+"""The parameters of a distribution, and the information of one reading about them."""
 
 
 def information(distribution: dist.Distribution) -> FisherInformation:
@@ -67,7 +64,7 @@ def information(distribution: dist.Distribution) -> FisherInformation:
         raise FitError(what, where="identify", hint=hint)
     parameters, matrix = formula(distribution)
     parameters = tuple(jnp.broadcast_to(x, shape) for x in parameters)
-    return FisherInformation(parameters, jnp.broadcast_to(matrix, (*shape, *matrix.shape[-2:])))
+    return parameters, jnp.broadcast_to(matrix, (*shape, *matrix.shape[-2:]))
 
 
 def _symmetric(first: Array, across: Array, second: Array) -> Array:
@@ -79,7 +76,7 @@ def _symmetric(first: Array, across: Array, second: Array) -> Array:
 def _normal(normal: dist.Normal) -> FisherInformation:
     precision = normal.scale**-2.0
     matrix = _symmetric(precision, jnp.zeros_like(precision), 2.0 * precision)
-    return FisherInformation((normal.loc, normal.scale), matrix)
+    return (normal.loc, normal.scale), matrix
 
 
 def _student(student: dist.StudentT) -> FisherInformation:
@@ -88,7 +85,7 @@ def _student(student: dist.StudentT) -> FisherInformation:
     location = (freedom + 1.0) / (freedom + 3.0) * precision
     scale = 2.0 * freedom / (freedom + 3.0) * precision
     matrix = _symmetric(location, jnp.zeros_like(precision), scale)
-    return FisherInformation((student.loc, student.scale), matrix)
+    return (student.loc, student.scale), matrix
 
 
 def _sensor(sensor: SensorStudentT) -> FisherInformation:
@@ -111,7 +108,7 @@ def _sensor(sensor: SensorStudentT) -> FisherInformation:
 
     of_all = jnp.vectorize(mean_outer_score, signature="(),(),()->(p,p)")
     matrix = of_all(sensor.location, sensor.scale, sensor.full_scale)
-    return FisherInformation((sensor.location, sensor.scale), matrix)
+    return (sensor.location, sensor.scale), matrix
 
 
 def _beta(beta: MeanConcentrationBeta) -> FisherInformation:
@@ -131,7 +128,7 @@ def _beta(beta: MeanConcentrationBeta) -> FisherInformation:
             functools.partial(_censored_beta, margin=beta.margin), signature="(),()->(p,p)"
         )(mean, concentration)
         matrix = jnp.where(is_far[..., None, None], matrix, censored)
-    return FisherInformation((mean, concentration), matrix)
+    return (mean, concentration), matrix
 
 
 def _censored_beta(mean: Array, concentration: Array, margin: float) -> Array:
@@ -184,10 +181,10 @@ def reading_information(
         trace = program.trace(z, data)
         for name in program.observed:
             distribution = trace[name]["fn"]
-            found = information(distribution)
+            of_noise, matrix = information(distribution)
             is_beta = isinstance(unwrapped(distribution), MeanConcentrationBeta)
-            parameters[name] = jnp.stack(found.parameters, axis=-1)
-            aux[name] = found.information, found.parameters[1] if is_beta else None
+            parameters[name] = jnp.stack(of_noise, axis=-1)
+            aux[name] = matrix, of_noise[1] if is_beta else None
         return parameters, aux
 
     jacobians, aux = jax.jacfwd(with_aux, has_aux=True)(z)

@@ -18,7 +18,6 @@ from polar_bayes.design.fisher import (
 )
 from polar_bayes.design.setup import (
     DesignProblem,
-    label_parameters,
     make_design_problem,
     parameter_vector,
     posterior_modes,
@@ -88,7 +87,7 @@ def identify(
 
 
 def _identify_at(problem: DesignProblem, mode: np.ndarray) -> xr.Dataset:
-    program, labels = problem.program, label_parameters(problem)
+    program = problem.program
 
     @compiled
     def evaluate(z: jax.Array, data: Observations) -> tuple:
@@ -105,7 +104,7 @@ def _identify_at(problem: DesignProblem, mode: np.ndarray) -> xr.Dataset:
         np.asarray(x) for x in evaluate(mode, problem.data)
     )
     prior = positive_definite(prior, problem.prior)
-    jacobian = jacobian[labels.rows]
+    jacobian = jacobian[problem.rows]
 
     def covariance_given(information: np.ndarray | float) -> np.ndarray:
         return jacobian @ np.linalg.inv(information + prior) @ jacobian.T
@@ -128,11 +127,11 @@ def _identify_at(problem: DesignProblem, mode: np.ndarray) -> xr.Dataset:
     sensitivity = np.sqrt(conditional(information))
     dataset = xr.Dataset(
         {
-            "value": ("parameter", values[labels.rows]),
-            "prior_sd": ("parameter", labels.prior_sd),
+            "value": ("parameter", values[problem.rows]),
+            "prior_sd": ("parameter", problem.prior_sd),
             "expected_sd": ("parameter", sd),
             "prior_share": ("parameter", (sd / before) ** 2),
-            "sensitivity": ("parameter", sensitivity * labels.prior_sd),
+            "sensitivity": ("parameter", sensitivity * problem.prior_sd),
             "paper_information": ("parameter", conditional(paper)),
             "exact_information": ("parameter", conditional(exact)),
             "paper_sd": ("parameter", paper_sd),
@@ -142,12 +141,12 @@ def _identify_at(problem: DesignProblem, mode: np.ndarray) -> xr.Dataset:
             "movement": (("direction", "parameter"), np.abs(weight.T) * sensitivity * before),
         },
         coords={
-            "parameter": labels.names,
-            "other": labels.names,
-            "name": ("parameter", [scalar.name for scalar in labels.scalars]),
+            "parameter": problem.names,
+            "other": problem.names,
+            "name": ("parameter", [scalar.name for scalar in problem.scalars]),
         },
     )
-    for scalar in labels.scalars:
+    for scalar in problem.scalars:
         dataset.attrs[f"meaning_of_{scalar.name}"] = notation(scalar.name).meaning
     return dataset.assign_attrs(provenance_attrs(problem.request))
 

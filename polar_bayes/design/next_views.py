@@ -39,7 +39,6 @@ from polar_bayes.design.setup import (
     PRIOR_DRAWS,
     DesignProblem,
     coordinate_indices,
-    label_parameters,
     make_design_problem,
     parameter_vector,
     posterior_draws,
@@ -201,11 +200,11 @@ def _selected(
 ) -> xr.Dataset:
     """The candidates that lower the criterion most, and what they are expected to do."""
     criterion, constraints = criterion or DOptimal(), constraints or Constraints()
-    request, labels = extended.request, label_parameters(extended)
-    rows = [i for i, one in enumerate(labels.scalars) if one.name in MATERIAL_PARAMETERS]
-    rows = rows or list(range(len(labels.scalars)))
-    names, unit = [labels.names[row] for row in rows], labels.prior_sd[rows]
-    design = design._replace(jacobian=design.jacobian[:, np.array(labels.rows)[rows]])
+    request, scalars = extended.request, extended.scalars
+    rows = [i for i, one in enumerate(scalars) if one.name in MATERIAL_PARAMETERS]
+    rows = rows or list(range(len(scalars)))
+    names, unit = [scalars[row].label for row in rows], extended.prior_sd[rows]
+    design = design._replace(jacobian=design.jacobian[:, np.array(extended.rows)[rows]])
 
     def loss(information: np.ndarray) -> np.ndarray:
         covariance = design.covariance(information) / np.outer(unit, unit)

@@ -26,7 +26,6 @@ from numpyro import distributions as dist
 
 from polar_bayes.design.setup import (
     DesignProblem,
-    label_parameters,
     make_design_problem,
     posterior_modes,
     provenance_attrs,
@@ -184,8 +183,7 @@ def _assemble(problem: DesignProblem, coordinate: Coordinate, curve: "ProfileCur
     low, high, open_below, open_above = zip(
         *(likelihood_interval(theta, row) for row in value), strict=True
     )
-    known = label_parameters(problem)
-    prior = known.scalars[known.names.index(coordinate.label)].draws
+    prior = problem.scalars[problem.names.index(coordinate.label)].draws
     beyond = [float(np.mean(prior < theta[0])), float(np.mean(prior > theta[-1]))]
     return xr.Dataset(
         {
@@ -211,21 +209,14 @@ def _assemble(problem: DesignProblem, coordinate: Coordinate, curve: "ProfileCur
 # --- The log density in its parts -----------------------------------------------------------------
 
 
-class LogDensityParts(NamedTuple):
-    """Log likelihood, with the log prior of known parameters, and the log prior of all others."""
-
-    likelihood: Float[Array, ""]
-    prior: Float[Array, ""]
-
-
 def log_density_parts(
     program: Program, known: Collection[str], z: Float[Array, " size"], data: Observations
-) -> LogDensityParts:
-    """The log posterior density of the unconstrained coordinates in its two parts."""
+) -> tuple[Array, Array]:
+    """Log likelihood, with the log prior of known parameters, and the log prior of all others."""
     terms, _ = program.log_terms(z, data)
     of_likelihood = {*program.observed, *known} & terms.keys()
     likelihood = sum(terms.pop(name) for name in sorted(of_likelihood))
-    return LogDensityParts(jnp.asarray(likelihood), sum(terms.values(), jnp.zeros((), z.dtype)))
+    return jnp.asarray(likelihood), sum(terms.values(), jnp.zeros((), z.dtype))
 
 
 def _weighted_potential(compiled_model: CompiledModel, known: frozenset[str]) -> JitOnce:
@@ -233,8 +224,8 @@ def _weighted_potential(compiled_model: CompiledModel, known: frozenset[str]) ->
 
     def potential(z: Array, given: tuple[float | Array, Observations]) -> Array:
         weight, data = given
-        terms = log_density_parts(compiled_model.program, known, z, data)
-        return -(terms.likelihood + weight * terms.prior)
+        likelihood, prior = log_density_parts(compiled_model.program, known, z, data)
+        return -(likelihood + weight * prior)
 
     return JitOnce(jax.value_and_grad(potential))
 

@@ -1,9 +1,10 @@
 """Set-up of a design problem: model, capture, posterior modes, and the labels of coordinates."""
 
+import dataclasses
+import functools
 import json
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -28,7 +29,8 @@ from polar_bayes.progress import Progress, no_progress
 PRIOR_DRAWS = 500
 
 
-class DesignProblem(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class DesignProblem:
     """A model and a capture, compiled, with unconstrained draws from the prior (draw, size)."""
 
     request: Request
@@ -40,6 +42,34 @@ class DesignProblem(NamedTuple):
     def program(self) -> Program:
         """The model as functions of one unconstrained vector."""
         return self.compiled_model.program
+
+    @functools.cached_property
+    def drawn(self) -> dict[str, Array]:
+        """Parameters of the draws from the prior, by name, (1, draw, ...)."""
+        return self.program.parameters_of_chains(self.prior[None], self.data)
+
+    @functools.cached_property
+    def scalars(self) -> list[Scalar]:
+        """The scalar parameters in the order of tables, with their draws from the prior."""
+        return label_scalars(self.program, self.request.capture, self.drawn)
+
+    @property
+    def names(self) -> list[str]:
+        """Such as `refractive_index[550]`."""
+        return [scalar.label for scalar in self.scalars]
+
+    @property
+    def prior_sd(self) -> np.ndarray:
+        """Of the draws from the prior, (parameter,)."""
+        return np.array([scalar.draws.std() for scalar in self.scalars])
+
+    @functools.cached_property
+    def rows(self) -> list[int]:
+        """The index of each scalar in the vector of all parameters."""
+        numbers = places({name: x.shape[2:] for name, x in self.drawn.items()})
+        positions = {name: x[None, None] for name, x in numbers.items()}
+        found = label_scalars(self.program, self.request.capture, positions)
+        return [int(scalar.draws.item()) for scalar in found]
 
 
 def provenance_attrs(request: Request, **more: object) -> dict[str, str]:
@@ -74,33 +104,6 @@ def parameter_vector(
 ) -> Float[Array, " parameter"]:
     """All parameters in one vector, by name."""
     return ravel_pytree(program.parameters(z, data))[0]
-
-
-class ParameterLabels(NamedTuple):
-    """The scalar parameters in the order of tables, and the index of each in the vector."""
-
-    scalars: list[Scalar]
-    rows: list[int]
-
-    @property
-    def names(self) -> list[str]:
-        """Such as `refractive_index[550]`."""
-        return [scalar.label for scalar in self.scalars]
-
-    @property
-    def prior_sd(self) -> np.ndarray:
-        """Of the draws from the prior, (parameter,)."""
-        return np.array([scalar.draws.std() for scalar in self.scalars])
-
-
-def label_parameters(problem: DesignProblem) -> ParameterLabels:
-    """Label every scalar parameter of a model, with its draws from the prior."""
-    program, capture = problem.program, problem.request.capture
-    draws = program.parameters_of_chains(problem.prior[None], problem.data)
-    numbers = places({name: x.shape[2:] for name, x in draws.items()})
-    positions = label_scalars(program, capture, {n: x[None, None] for n, x in numbers.items()})
-    rows = [int(scalar.draws.item()) for scalar in positions]
-    return ParameterLabels(label_scalars(program, capture, draws), rows)
 
 
 # --- Draws of the posterior, over which the criterion of a design is averaged ---------------------

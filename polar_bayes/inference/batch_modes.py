@@ -14,8 +14,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from polar_bayes.inference.batching import ObservationBatch, batched, batched_lanes
-from polar_bayes.inference.compiled_model import BATCH, CompiledModel
+from polar_bayes.inference.batching import batched, batched_lanes
+from polar_bayes.inference.compiled_model import CompiledModel
+from polar_bayes.inference.problem_batch import BATCH, ProblemBatch
 from polar_bayes.inference.scoring import exact_derivatives, scoring_derivatives
 from polar_bayes.numerics.batches import map_batches, put_rows, take_rows
 from polar_bayes.numerics.compile import JitOnce
@@ -44,12 +45,6 @@ evaluates the derivatives, which is enough for most pixels. The expected informa
 definite everywhere and exact curvature is not, so that the long way is gone with the former:
 narrow lobes take up to 60 steps."""
 
-CONDITIONAL_PASSES = (4, 4, 8, 16, 32)
-"""Steps of the passes to a mode given one coordinate: bent ridges take dozens."""
-
-SINGLE_GOAL = 1e-4
-"""The Newton decrement, in posterior sds, at which steps in single precision stop."""
-
 GOALS = {"double": 1e-4, "single": 1e-2}
 """The decrement at which a pixel has converged; single precision resolves it no better."""
 
@@ -63,86 +58,69 @@ class ModeSearch(NamedTuple):
 
 
 def find_starts(
-    engine: CompiledModel, pixels: ObservationBatch, candidates: int = PRIOR_DRAWS
+    batch: ProblemBatch, candidates: int = PRIOR_DRAWS
 ) -> Float[np.ndarray, "pixel rank size"]:
     """Draws from the prior at which each pixel starts, the one of highest density first."""
     # The largest program compiles while the others are traced and run.
-    unknown = init(np.zeros((1, engine.program.size), engine.dtype))
-    engine.begin(_stepping, False, pixels, unknown, given=(np.int32(1),))
-    return engine.run(_starts, candidates, pixels, single=True)
-
-
-def find_modes(engine: CompiledModel, pixels: ObservationBatch) -> ModeSearch:
-    """The mode of every pixel, from the best of its starts."""
-    return find_modes_from(engine, pixels, find_starts(engine, pixels)[:, 0])
+    unknown = init(np.zeros((1, batch.engine.program.size), batch.engine.dtype))
+    batch.begin(_stepping, False, unknown, given=(np.int32(1),))
+    return batch.run(_starts, candidates, single=True)
 
 
 def find_modes_from(
-    engine: CompiledModel,
-    pixels: ObservationBatch,
-    start: Float[np.ndarray, "pixel size"],
-    known: ModeSearch | None = None,
+    batch: ProblemBatch, start: Float[np.ndarray, "pixel size"], known: ModeSearch | None = None
 ) -> ModeSearch:
     """The mode of every pixel, from a vector of its own; a search that ends at `known` is that."""
     fast = jax.tree.map(np.array, init(start))
     for count in SINGLE_PASSES:
         left = np.flatnonzero(~fast.settled)
         if left.size:
-            put_rows(fast, left, _advance(engine, pixels, fast, left, count, single=True))
+            put_rows(fast, left, _advance(batch, fast, left, count, single=True))
     if known is None:
-        return _refine(engine, pixels, start, fast)
+        return _refine(batch, start, fast)
     is_known = known.mode.distance(fast.z) < SAME_MODE
     new = np.flatnonzero(~is_known)
     found = jax.tree.map(np.array, known)
     if new.size:
-        put_rows(found, new, _refine(engine, pixels.subset(new), start[new], take_rows(fast, new)))
+        put_rows(found, new, _refine(batch.subset(new), start[new], take_rows(fast, new)))
     return found
 
 
-def _refine(
-    engine: CompiledModel, pixels: ObservationBatch, start: np.ndarray, fast: LMState
-) -> ModeSearch:
+def _refine(batch: ProblemBatch, start: np.ndarray, fast: LMState) -> ModeSearch:
     """The modes near where searches in single precision have ended."""
+    engine, everywhere = batch.engine, np.arange(len(batch))
     is_finite = np.isfinite(fast.z).all(axis=-1, keepdims=True)
     state = init(np.where(is_finite, fast.z, start).astype(engine.dtype))
     first, *further = EXACT_PASSES
-    everywhere = np.arange(len(pixels))
-    state = _advance(engine, pixels, state, everywhere, first, single=False)
-    state = jax.tree.map(np.array, state)
+    state = jax.tree.map(np.array, _advance(batch, state, everywhere, first))
     found = jax.tree.map(np.array, _finalized(engine, state))
     goal = GOALS[engine.precision]
     for count in further:
         left = np.flatnonzero(~(found.decrement < goal))
         if not left.size:
             break
-        moved = _advance(engine, pixels, state, left, count, single=False)
+        moved = _advance(batch, state, left, count)
         put_rows((state, found), left, (moved, _finalized(engine, moved)))
     converged = (found.decrement < goal) & np.isfinite(found.root).all(axis=(1, 2))
     return ModeSearch(found, fast.steps + state.steps, converged)
 
 
 def _advance(
-    engine: CompiledModel,
-    pixels: ObservationBatch,
-    state: LMState,
-    which: np.ndarray,
-    count: int,
-    *,
-    single: bool,
+    batch: ProblemBatch, state: LMState, which: np.ndarray, count: int, *, single: bool = False
 ) -> LMState:
-    some = pixels.subset(which), take_rows(state, which)
-    return engine.run(_stepping, single, *some, given=(np.int32(count),), single=single)
+    given, some = (np.int32(count),), take_rows(state, which)
+    return batch.subset(which).run(_stepping, single, some, given=given, single=single)
 
 
 def find_all_modes(
-    engine: CompiledModel, pixels: ObservationBatch
+    batch: ProblemBatch,
 ) -> tuple[Int[np.ndarray, " mode"], NormalApproximation]:
     """Distinct modes of each pixel, the heaviest first, and the pixel that each belongs to."""
     ends: list[NormalApproximation] = []
     is_new: list[np.ndarray] = []
-    starts, first = find_starts(engine, pixels), None
+    starts, first = find_starts(batch), None
     for rank in range(starts.shape[1]):
-        search = find_modes_from(engine, pixels, starts[:, rank], first)
+        search = find_modes_from(batch, starts[:, rank], first)
         first, (mode, _, converged) = first or search, search
         for other, kept in zip(ends, is_new, strict=True):
             converged = converged & ~(kept & (other.distance(mode.z) < SAME_MODE))
@@ -155,18 +133,16 @@ def find_all_modes(
 
 
 def find_conditional_modes(
-    engine: CompiledModel,
-    pixels: ObservationBatch,
-    z: Float[np.ndarray, "pixel size"],
-    fixed: Int[np.ndarray, " pixel"],
+    batch: ProblemBatch, z: Float[np.ndarray, "pixel size"], fixed: Int[np.ndarray, " pixel"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The mode near a vector of each pixel given one of its coordinates; potential and Hessian."""
-    free = 1.0 - np.eye(z.shape[1], dtype=engine.dtype)[fixed]
-    state = jax.tree.map(np.array, init(z.astype(engine.dtype))._replace(free=free))
-    for count in CONDITIONAL_PASSES:
+    dtype = batch.engine.dtype
+    free = 1.0 - np.eye(z.shape[1], dtype=dtype)[fixed]
+    state = jax.tree.map(np.array, init(z.astype(dtype))._replace(free=free))
+    for count in (4, 4, 8, 16, 32):  # steps of each pass: bent ridges take dozens
         left = np.flatnonzero(~state.settled)
         if left.size:
-            put_rows(state, left, _advance(engine, pixels, state, left, count, single=False))
+            put_rows(state, left, _advance(batch, state, left, count))
     value, _, curvature = state.derivatives
     return np.asarray(state.z), np.asarray(value), np.asarray(curvature)
 
@@ -190,7 +166,8 @@ def _starts(engine: CompiledModel, candidates: int) -> JitOnce:
 
 def _stepping(engine: CompiledModel, single: bool) -> JitOnce:
     """A program of any number of steps."""
-    goal = SINGLE_GOAL if single else 0.1 * GOALS[engine.precision]
+    # The decrement, in posterior sds, at which steps end.
+    goal = 1e-4 if single else 0.1 * GOALS[engine.precision]
     program = engine.single_program if single else engine.program
     derivatives_of = scoring_derivatives if single else exact_derivatives
 

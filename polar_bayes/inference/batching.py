@@ -9,7 +9,7 @@ import dataclasses
 import enum
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, Self
 
 import equinox as eqx
 import jax
@@ -35,6 +35,13 @@ class ObservationBatch:
     batched: Observations
     static: Observations
     views: np.ndarray
+
+    @classmethod
+    def of(cls, arrays: Observations, is_batched: Observations) -> Self:
+        """Arrays, and which of them begin with the pixel axis; `valid` does."""
+        valid = np.asarray(arrays.valid)
+        views = valid.any(axis=tuple(range(1, valid.ndim - 1))).sum(axis=-1)
+        return cls(*eqx.partition(arrays, is_batched), views)
 
     def __len__(self) -> int:
         return len(self.views)
@@ -66,41 +73,28 @@ def batch_pixels(
     image: Observations, batched_directions: frozenset[str] = frozenset()
 ) -> ObservationBatch:
     """Flatten an image, or a block of it, to a batch of pixels."""
-    rows, columns = image.shape[:2]
+    (rows, columns), own_axes = image.shape[:2], image.dims[len(IMAGE) :]
+    image = dataclasses.replace(image, dims=own_axes)
+    every = jax.tree.map(lambda _: True, image)
+    angles: dict[str, Any] = {
+        n: x and n in batched_directions for n, x in every.geometry._asdict().items()
+    }
+    is_batched = dataclasses.replace(
+        every,
+        geometry=Geometry(**angles),
+        full_scale=False,
+        intensity_unit=False,
+        confidence=every.confidence and "normal_confidence" in batched_directions,
+        shared=jax.tree.map(lambda _: False, image.shared),
+    )
 
-    def of_pixels(x: Array) -> np.ndarray:
-        whole = np.broadcast_to(np.asarray(x), (rows, columns, *x.shape[2:]))
-        return whole.reshape(rows * columns, *x.shape[2:])
+    def flat(x: Array, of_pixels: bool) -> np.ndarray:
+        own = x.shape[len(IMAGE) :]
+        if not of_pixels:
+            return np.asarray(x).reshape(own)
+        return np.broadcast_to(np.asarray(x), (rows, columns, *own)).reshape(rows * columns, *own)
 
-    def of_all(x: Array) -> np.ndarray:
-        return np.asarray(x).reshape(x.shape[2:])
-
-    def part(is_batched: bool) -> Observations:
-        """One of the two parts; None stands where the other part has the array."""
-
-        def take(x: Array | None, belongs: bool) -> Any:
-            if x is None or belongs != is_batched:
-                return None
-            return of_pixels(x) if is_batched else of_all(x)
-
-        angles = {n: take(x, n in batched_directions) for n, x in image.geometry._asdict().items()}
-        return Observations(
-            geometry=Geometry(**angles),
-            readings={n: take(x, True) for n, x in image.readings.items()},
-            errors={n: take(x, True) for n, x in image.errors.items()},
-            brightness=take(image.brightness, True),
-            full_scale=take(image.full_scale, False),
-            intensity_unit=take(image.intensity_unit, False),
-            valid=take(image.valid, True),
-            saturated=take(image.saturated, True),
-            dims=tuple(axis for axis in image.dims if axis[0] not in IMAGE),
-            confidence=take(image.confidence, "normal_confidence" in batched_directions),
-            shared=jax.tree.map(lambda x: None if is_batched else np.asarray(x), image.shared),
-        )
-
-    valid = np.broadcast_to(np.asarray(image.valid), image.shape)
-    views = np.any(valid, axis=tuple(range(2, valid.ndim - 1))).sum(axis=-1).ravel()
-    return ObservationBatch(part(True), part(False), views)
+    return ObservationBatch.of(jax.tree.map(flat, image, is_batched), is_batched)
 
 
 def cut(image: xr.Dataset, pixels: int) -> Iterator[dict[str, slice]]:

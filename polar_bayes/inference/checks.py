@@ -40,9 +40,6 @@ CARRIES = 0.3
 ANGLE_SCALES = (4.0, 15.0)
 """Length scales of structure over directions, unit degree."""
 
-SMALLEST_TAIL = 1e-300
-"""Probability below which a tail is not told from zero."""
-
 
 def tail_scores(
     below: Float[np.ndarray, "... parameter"], end: Float[np.ndarray, " parameter"]
@@ -54,7 +51,7 @@ def tail_scores(
     """
     away = np.where(end < 0.0, 1.0 - below, below)
     tails = np.where(end == 0.0, 2.0 * np.minimum(below, 1.0 - below), away)
-    tails = np.clip(tails, SMALLEST_TAIL, 1.0)
+    tails = np.clip(tails, 1e-300, 1.0)  # a smaller one is not told from zero
     scores = stats.norm.isf(np.where(end == 0.0, tails / 2.0, tails))
     return tails, np.maximum(scores, 0.0)
 

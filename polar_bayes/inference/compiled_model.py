@@ -4,48 +4,23 @@ Programs of batches are made by functions `make(compiled_model, settings)` in th
 algorithm. A model compiles each once and keeps it, so all captures of a layout share the programs.
 """
 
-import contextlib
 import dataclasses
 import functools
-import os
-from collections.abc import Callable, Hashable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
-from polar_bayes.inference.batching import ObservationBatch
-from polar_bayes.inference.cache_key import cache_key, layout_of
 from polar_bayes.inference.initialization import AbstractInitializer, make_initializer
+from polar_bayes.inference.model_parts import ModelParts, layout_of
 from polar_bayes.inference.program import Model, Program, compile_program, from_prior
-from polar_bayes.inference.request import Request, bind_model
+from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import dims_of, shape_of
-from polar_bayes.numerics.batches import batches, map_batches
-from polar_bayes.numerics.compile import TRACING_LOCK, JitOnce, LRUCache
+from polar_bayes.numerics.compile import TRACING_LOCK, LRUCache
 from polar_bayes.observation.data import Observations
-
-BATCH = 128
-"""Captures that one call of a program takes."""
-
-SMALL_BATCH = 4
-"""The same where each has particles of its own."""
-
-DRAW_BATCH = 64
-"""Draws of one capture that are evaluated together: more are shared among cores that then wait for
-each other."""
-
-MAX_LAYOUTS = 16
-"""Models by layout that stay compiled: all candidates of a comparison of scenes, and some more."""
-
-MAX_PROGRAMS = 64
-"""Programs that methods have made of one of them, by settings, that stay compiled."""
-
-_THREADS = ThreadPoolExecutor(os.cpu_count() or 1, "polar_bayes batches")
-"""That run batches of all images at once: a core is not shared by two."""
 
 MOMENTS = 4000
 """Draws by which the moments of priors are found."""
@@ -59,18 +34,18 @@ class CompiledModel:
     """
 
     bind: Callable[[], Model]
-    model: Model
     program: Program
     layout: Observations
     precision: str
     priors: Mapping[str, dist.Distribution] = dataclasses.field(default_factory=dict)
-    _made: LRUCache[Any] = dataclasses.field(default_factory=lambda: LRUCache(MAX_PROGRAMS))
+    _made: LRUCache[Any] = dataclasses.field(default_factory=lambda: LRUCache(64))
+    """Programs that methods have made of the model, by settings."""
 
     @functools.cached_property
     def initializer(self) -> AbstractInitializer:
         """The search for posterior modes of one capture."""
         with jax.enable_x64(self.precision == "double"), TRACING_LOCK:  # whoever asks first
-            return make_initializer(self.model, self.program, self.layout)
+            return make_initializer(self.program, self.layout)
 
     def free(self, data: Observations) -> Observations:
         """A capture with room for what is held; not one of groups that are fitted apart first."""
@@ -92,62 +67,6 @@ class CompiledModel:
     def made[S: Hashable, P](self, make: Callable[["CompiledModel", S], P], settings: S) -> P:
         """What a method makes of the model for its settings, a program say, at its first use."""
         return self._made.of((make, settings), lambda: make(self, settings))
-
-    def run[S: Hashable](
-        self,
-        make: Callable[["CompiledModel", S], JitOnce],
-        settings: S,
-        pixels: ObservationBatch,
-        *states: Any,
-        given: tuple = (),
-        batch: int = BATCH,
-        single: bool = False,
-    ) -> Any:
-        """Run a program on all pixels; `given` arguments are the same for all of them."""
-        double = not single and self.dtype == np.float64
-        with self._arguments(pixels, states, given, batch, single=single) as arguments:
-            program, device = self.made(make, settings), jax.config.jax_default_device
-            if not program.is_begun:  # a thread that was abandoned must not trace in another one
-                program.program(*arguments(next(batches(len(pixels), batch))))
-
-            def of_batch(index: np.ndarray) -> Any:
-                with jax.enable_x64(double), jax.default_device(device):  # no thread inherits them
-                    return program(*arguments(index))
-
-            threads = _THREADS.map if len(pixels) > batch else map
-            return map_batches(of_batch, len(pixels), batch, threads)
-
-    def begin[S: Hashable](
-        self,
-        make: Callable[["CompiledModel", S], JitOnce],
-        settings: S,
-        pixels: ObservationBatch,
-        *states: Any,
-        given: tuple = (),
-        single: bool = False,
-    ) -> None:
-        """Begin to compile what `run` needs, in parallel with what follows, given one state."""
-        program = self.made(make, settings)
-        if not program.is_begun:
-            with self._arguments(pixels, states, given, BATCH, single=single) as arguments:
-                program.begin(*arguments(np.zeros(BATCH, int)))
-
-    @contextlib.contextmanager
-    def _arguments(
-        self, pixels: ObservationBatch, states: tuple, given: tuple, batch: int, *, single: bool
-    ) -> Iterator[Callable[[np.ndarray], tuple]]:
-        """The arguments of a program for the pixels of a batch, in its precision."""
-        dtype = np.float32 if single else self.dtype
-        with jax.enable_x64(dtype == np.float64):
-            pixels = pixels.in_precision(dtype)
-            static, count = jax.tree.map(jnp.asarray, pixels.static), len(pixels)
-
-            def arguments(index: np.ndarray) -> tuple:
-                wanted = np.int32(min(batch, count - index[0]))
-                state = jax.tree.map(lambda x: x[index], states)
-                return (*given, wanted, pixels.take(index), static, *state)
-
-            yield arguments
 
     @functools.cached_property
     def parameter_axes(self) -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
@@ -187,23 +106,13 @@ def _prior_draws(compiled_model: CompiledModel, count: int) -> np.ndarray:
         return np.asarray(from_prior(compiled_model.program, key, count, data))
 
 
-def evaluate_draws(
-    program: Program, z: Float[Array, "draw size"], data: Observations
-) -> tuple[dict[str, Array], Float[Array, " draw"]]:
-    """Parameters and log posterior densities of draws of one pixel; minus infinity for NaN."""
-    parameters, values = jax.lax.map(
-        lambda z: program.parameters_and_potential(z, data), z, batch_size=DRAW_BATCH
-    )
-    return parameters, jnp.where(jnp.isnan(values), -jnp.inf, -values)
-
-
-_COMPILED: LRUCache[CompiledModel] = LRUCache(MAX_LAYOUTS)
+_COMPILED: LRUCache[CompiledModel] = LRUCache(16)
+"""Models by layout: all candidates of a comparison of scenes, and some more."""
 
 
 def compile_model(request: Request, data: Observations) -> CompiledModel:
     """The compiled model of a capture and of every other one of its layout, from the cache."""
-    parts = request.model, request.scene, request.priors, request.links
-    key = cache_key(*parts, request.precision, layout_of(data))
+    key = request.key(request.precision, layout_of(data))
     return compile_layout(key, request, lambda: data)
 
 
@@ -211,16 +120,15 @@ def compile_layout(
     key: str, request: Request, observe: Callable[[], Observations]
 ) -> CompiledModel:
     """The same where a text is known that tells layouts apart without a capture."""
-    parts = request.model, request.scene, request.priors, request.links
+    # Without the capture, which would stay in memory.
+    parts = ModelParts(request.model, request.scene, request.priors, request.links)
 
     def make() -> CompiledModel:
-        bind = functools.partial(bind_model, *parts)
         data, is_double = observe(), request.precision == "double"
         data = data if is_double else data.in_single_precision()
         with jax.enable_x64(is_double):
-            model = bind()
-            program = compile_program(model, data)
-        return CompiledModel(bind, model, program, data, request.precision, request.priors)
+            program = compile_program(parts.bind(), data)
+        return CompiledModel(parts.bind, program, data, request.precision, parts.priors)
 
     with TRACING_LOCK:
         return _COMPILED.of(key, make)
@@ -231,5 +139,4 @@ def layout_key(request: Request, *further: object) -> str:
     layout = [
         (name, v.dims, v.shape, str(v.dtype)) for name, v in request.capture.variables.items()
     ]
-    parts = request.model, request.scene, request.priors, request.links
-    return cache_key(*parts, request.precision, layout, *further)
+    return request.key(request.precision, layout, *further)

@@ -21,6 +21,7 @@ Source:
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, override
 
 import equinox as eqx
@@ -31,29 +32,19 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
-from polar_bayes.inference.program import AbstractDensity, Program, in_blocks
+from polar_bayes.inference.program import AbstractDensity, Program, in_blocks, raveled
 from polar_bayes.inference.sum_reparam import SumReparam, find_sum
 from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.observation.data import Observations
-
-MOST_COEFFICIENTS = 16
-"""More than so many are left as they are: their precision is factored for every gradient."""
-
-
-STEP = 0.01
-"""Of differences, in coordinates that are about standard normal."""
-
-SIDE_BY_SIDE = 50
-"""Vectors that are vectorized over."""
 
 
 class ConditionalInputs(eqx.Module):
     """The mode, with the regression of the coefficients on the others there, and the capture."""
 
+    data: Observations
     others: Float[Array, " other"]
     coefficients: Float[Array, " coefficient"]
     slope: Float[Array, "coefficient other"]
-    data: Observations
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -69,13 +60,14 @@ class ConditionalReparam(AbstractDensity[ConditionalInputs]):
     coefficients: np.ndarray
     others: np.ndarray
     sums: SumReparam | None
+    by_name: Callable[[Array], dict[str, Array]]
 
     @override
     def potential(self, x: Float[Array, " size"], given: ConditionalInputs) -> Float[Array, ""]:
         x, w, log_volume = self._moved(x, given)
         # Not of one flat vector: the optics, which depend on other sites only, are then found to be
         # the same as in the Gauss-Newton step, and computed once.
-        sites = self.program.unravel(x) | self._by_name(w)
+        sites = self.program.unravel(x) | self.by_name(w)
         return self.program.potential_at(sites, given.data) - log_volume
 
     def forward(
@@ -97,9 +89,7 @@ class ConditionalReparam(AbstractDensity[ConditionalInputs]):
     def forward_of_block(self) -> JitOnce:
         """`forward` of many vectors, compiled."""
         return JitOnce(
-            lambda x, given: jax.lax.map(
-                lambda one: self.forward(one, given), x, batch_size=SIDE_BY_SIDE
-            )
+            lambda x, given: jax.lax.map(lambda one: self.forward(one, given), x, batch_size=50)
         )
 
     def inputs(
@@ -111,22 +101,24 @@ class ConditionalReparam(AbstractDensity[ConditionalInputs]):
         slope = np.linalg.solve(among, across.T).T
         others = mode[self.others]
         if self.sums is not None:
-            # By central differences: the regression decides only how efficient sampling is.
-            steps = np.vstack([0.0 * mode, STEP * np.eye(len(mode)), -STEP * np.eye(len(mode))])
+            # By central differences in coordinates that are about standard normal: the regression
+            # decides only how efficient sampling is.
+            apart = 0.01 * np.eye(len(mode))
+            steps = np.vstack([0.0 * mode, apart, -apart])
             at, *moved = self.backward((mode + steps).astype(mode.dtype), data)[:, self.others]
             ahead, behind = np.split(np.stack(moved), 2)
-            moves = (ahead - behind)[self.others].T / (2.0 * STEP)
+            moves = (ahead - behind)[self.others].T / (2.0 * apart[0, 0])
             others, slope = at, np.linalg.solve(moves.T, slope.T).T
         dtype = data.brightness.dtype
         parts = others, mode[self.coefficients], slope
-        return ConditionalInputs(*(jnp.asarray(part, dtype) for part in parts), data)
+        return ConditionalInputs(data, *(jnp.asarray(part, dtype) for part in parts))
 
     def inputs_like(self, data: Observations) -> ConditionalInputs:
         """Inputs of the shapes that `inputs` gives, for programs to be compiled."""
         dtype, count = data.brightness.dtype, len(self.coefficients)
         others = jnp.zeros(len(self.others), dtype)
         slope = jnp.zeros((count, len(self.others)), dtype)
-        return ConditionalInputs(others, jnp.zeros(count, dtype), slope, data)
+        return ConditionalInputs(data, others, jnp.zeros(count, dtype), slope)
 
     def _moved(
         self, x: Float[Array, " size"], given: ConditionalInputs
@@ -152,7 +144,7 @@ class ConditionalReparam(AbstractDensity[ConditionalInputs]):
 
         def predict(w: Array) -> tuple[list[Array], Any]:
             """Means of all readings; and these with variances, readings and the priors of w."""
-            trace = program.trace_at(sites | self._by_name(w), given.data)
+            trace = program.trace_at(sites | self.by_name(w), given.data)
             noise = [moments(trace[name]["fn"], trace[name]["value"]) for name in program.observed]
             priors = [trace[name]["fn"] for name in self.names]
             means, variances, readings = zip(*noise, strict=True)
@@ -169,15 +161,6 @@ class ConditionalReparam(AbstractDensity[ConditionalInputs]):
             pull = pull + jnp.einsum("...i,...->i", slope, weight * residual)
         lower = jnp.linalg.cholesky(precision)
         return start + cho_solve((lower, True), pull), lower
-
-    def _by_name(self, w: Array) -> dict[str, Array]:
-        found, begin = {}, 0
-        for name in self.names:
-            shape = self.program.events[name]
-            count = int(np.prod(shape))
-            found[name] = w[begin : begin + count].reshape(shape)
-            begin += count
-        return found
 
 
 def moments(distribution: dist.Distribution, reading: Array) -> tuple[Array, Array, Array]:
@@ -203,11 +186,14 @@ def find_coefficients(program: Program, data: Observations) -> ConditionalRepara
     )
     found = [positions[name].ravel() for name in names]
     count = sum(len(each) for each in found)
-    if not 0 < count <= MOST_COEFFICIENTS or count == program.size:
+    most = 16  # the precision of the coefficients is factored for every gradient
+    if not 0 < count <= most or count == program.size:
         return None
     coefficients = np.concatenate(found)
     others = np.setdiff1d(np.arange(program.size), coefficients)
-    reparam = ConditionalReparam(program, names, coefficients, others, find_sum(program))
+    shapes = {name: jax.ShapeDtypeStruct(program.events[name], jnp.float32) for name in names}
+    by_name = raveled(shapes)[1]
+    reparam = ConditionalReparam(program, names, coefficients, others, find_sum(program), by_name)
     try:
         given = reparam.inputs_like(data)
         jax.eval_shape(reparam.potential, jnp.zeros(program.size), given)

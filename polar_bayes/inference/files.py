@@ -444,7 +444,6 @@ SCENES = Group(
 )
 """The group `scenes`: the comparison behind a fit with scene="auto"."""
 
-_TEXTS = ("unit", "meaning")
 _FLAGS = ("valid", "saturated", "diverging", "reached_max_treedepth")
 _OF_READINGS = Group(DRAWS, tied=True, like=Like("observed_data", {"": DRAWS}))
 FIT = Schema(

@@ -196,13 +196,13 @@ def find_group_model(model: Model, groups: Groups, data: Observations) -> GroupM
 class ReparamInputs(eqx.Module):
     """The capture and the expansion point, which is in no program: moving it compiles nothing."""
 
+    data: Observations
     common: Float[Array, " common"]
     factor: Float[Array, "common common"]
     local: Float[Array, "group local"]
     gradient: Float[Array, "group local"]
     hessian: Float[Array, "group local local"]
     mixed: Float[Array, "group local common"]
-    data: Observations
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -316,12 +316,6 @@ TYPICAL_DRAWS = 200
 FEWEST_STARTS, MOST_STARTS, ALL_STARTS = 4, 16, 256
 """Starts of each group, and of all groups together where each may have more than the fewest."""
 
-MOST_ROUNDS = 4
-"""Joint optimizations, each around the end of the one before."""
-
-WIDEST = 3.0
-"""Largest standard deviation of a common coordinate that is taken from its Hessian."""
-
 
 class GroupModes(NamedTuple):
     """The modes of every group, and the common coordinates at which they were found."""
@@ -352,7 +346,8 @@ class ReparamSearch:
         modes = self.group_modes(key)
         common, local = modes.common, np.stack([each.z[0] for each in modes.of_group])
         factor = np.eye(common.size)
-        for number in range(MOST_ROUNDS):
+        rounds = 4  # of joint optimization at most, each around the end of the one before
+        for number in range(rounds):
             given, potential = self.expand(common, local, factor, modes)
             w = scipy.optimize.minimize(
                 finite_potential(potential),
@@ -364,7 +359,7 @@ class ReparamSearch:
             z = np.asarray(self.reparam.forward_jit(jnp.asarray(w, dtype), given), float)
             common, local = z[groups.common], z[groups.local]
             factor = _common_factor(potential, w, factor, dtype)
-            self.progress("joining the patches", (number + 1) / MOST_ROUNDS)
+            self.progress("joining the patches", (number + 1) / rounds)
             if number and np.linalg.norm(w) < 0.1 * np.sqrt(w.size):
                 break
         return *self.expand(common, local, factor, modes), modes
@@ -393,7 +388,7 @@ class ReparamSearch:
             # Derivatives by hyperparameters belong to the population.
             mixed.append(cross * modes.movable)
         arrays = (common, factor, local, *map(np.stack, (gradients, hessians, mixed)))
-        given = ReparamInputs(*(jnp.asarray(x, self.dtype) for x in arrays), self.data)
+        given = ReparamInputs(self.data, *(jnp.asarray(x, self.dtype) for x in arrays))
         return given, NumpyPotential(self.reparam.value_and_gradient, given, self.dtype)
 
     def group_modes(self, key: Array) -> GroupModes:
@@ -484,4 +479,5 @@ def _common_factor(
     inverse = np.linalg.inv(factor)  # from w to the coordinates of the program
     hessian = inverse.T @ symmetrize(np.nan_to_num(rows[:, :size])) @ inverse
     values, vectors = np.linalg.eigh(hessian)
-    return np.linalg.cholesky((vectors / np.maximum(values, WIDEST**-2)) @ vectors.T)
+    widest = 3.0  # standard deviation that is taken from the Hessian
+    return np.linalg.cholesky((vectors / np.maximum(values, widest**-2)) @ vectors.T)

@@ -32,7 +32,6 @@ from polar_bayes.inference.hierarchical_reparam import (
 )
 from polar_bayes.inference.program import (
     BLOCK,
-    Model,
     Program,
     begin_from_prior,
     first_key,
@@ -51,6 +50,7 @@ from polar_bayes.numerics.optimize import (
     finite_sd,
     ignore_line_search_warnings,
 )
+from polar_bayes.numerics.psis import numpy_generator
 from polar_bayes.observation.data import Observations
 from polar_bayes.progress import Progress
 
@@ -58,10 +58,6 @@ STARTS = 16
 
 HEAVY_MODE = 0.01
 """Laplace weight of a mode that chains must have visited."""
-
-LARGEST_DENSE = 60
-"""Most coordinates whose covariance a warm-up of some hundred draws can estimate. The posterior of
-the common parameters can have any shape with few groups; with many it is close to normal."""
 
 Draws = tuple[np.ndarray, dict[str, np.ndarray]]
 """Unconstrained draws (chain, draw, size), and statistics, each (chain, draw)."""
@@ -145,13 +141,17 @@ class AbstractInit(abc.ABC):
     def laplace(self, key: Array, chains: int, draws: int) -> Draws:
         """Draws from the normal approximation at the mode of largest weight."""
 
-    @abc.abstractmethod
     def joint_modes(self, where: str) -> Modes:
         """The modes of all coordinates together; a `FitError` where groups have modes each."""
+        return self.joint_coordinates(where).modes
 
-    @abc.abstractmethod
     def joint_coordinates(self, where: str) -> Coordinates:
         """Coordinates for draws of all together; a `FitError` where groups have modes each."""
+        raise FitError(
+            "it approximates one material; weights of many patches together are useless",
+            where=where,
+            hint="use method='nuts'",
+        )
 
     @abc.abstractmethod
     def missed_mode_weight(self, z: np.ndarray) -> float:
@@ -170,7 +170,7 @@ class JointInit(AbstractInit):
 
     @override
     def target(self, key: Array, chains: int) -> Target:
-        random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        random = numpy_generator(key)
         coordinates, starts = self.joint_coordinates("Nuts"), []
         modes, potential = coordinates.modes, coordinates.potential
         for mode in random.choice(len(modes.weight), size=chains, p=modes.weight):
@@ -270,7 +270,9 @@ class HierarchicalInit(AbstractInit):
     @override
     def target(self, key: Array, chains: int) -> Target:
         size, dtype = self.reparam.size, self.given.common.dtype
-        few = size <= LARGEST_DENSE
+        # A warm-up of some hundred draws can estimate the covariance of so few. The posterior of
+        # common parameters can have any shape with few groups; with many it is about normal.
+        few = size <= 60
         return Target(
             density=self.reparam.potential_jit,
             given=self.given,
@@ -284,7 +286,7 @@ class HierarchicalInit(AbstractInit):
 
     def _draw_starts(self, key: Array, chains: int) -> np.ndarray:
         """Starting points in w: each group at one of its modes, drawn by weight."""
-        random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        random = numpy_generator(key)
         reparam, dtype = self.reparam, self.given.common.dtype
         starts = []
         for _ in range(chains):
@@ -303,22 +305,6 @@ class HierarchicalInit(AbstractInit):
     def laplace(self, key: Array, chains: int, draws: int) -> Draws:
         noise = np.asarray(jax.random.normal(key, (chains, draws, self.reparam.size)))
         return self._to_program(noise), _weigh(self.potential, noise, noise)
-
-    @override
-    def joint_coordinates(self, where: str) -> Coordinates:
-        raise self._no_joint_approximation(where)
-
-    @override
-    def joint_modes(self, where: str) -> Modes:
-        raise self._no_joint_approximation(where)
-
-    @staticmethod
-    def _no_joint_approximation(where: str) -> FitError:
-        return FitError(
-            "it approximates one material; weights of many patches together are useless",
-            where=where,
-            hint="use method='nuts'",
-        )
 
     @override
     def missed_mode_weight(self, z: np.ndarray) -> float:
@@ -362,7 +348,6 @@ class AbstractInitializer(abc.ABC):
 
         None where the shapes are not known, as by default.
         """
-        del data
         return None
 
 
@@ -407,17 +392,13 @@ class JointInitializer(AbstractInitializer):
 
     @override
     def prepare_target(self, data: Observations) -> Target:
-        size, reparam = self.program.size, self.reparam
-        starts, metric = np.zeros((1, size)), np.eye(size)
-
-        def target(density: Callable, given: object) -> Target:
-            return Target(density, given, lambda z: (0.0, z), starts, metric)
-
-        if reparam is None:
-            return target(self.program.potential_jit, data)
-        given = reparam.inputs_like(data)
-        reparam.value_and_gradient.begin(starts[0], given)
-        return target(reparam.potential_jit, given)
+        density: Density = self.program.potential_jit
+        given: object = data
+        starts, metric = np.zeros((1, self.program.size)), np.eye(self.program.size)
+        if self.reparam is not None:
+            density, given = self.reparam.potential_jit, self.reparam.inputs_like(data)
+            self.reparam.value_and_gradient.begin(starts[0], given)
+        return Target(density, given, lambda z: (0.0, z), starts, metric)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -440,10 +421,10 @@ class HierarchicalInitializer(AbstractInitializer):
         return HierarchicalInit(self.reparam, given, potential, modes.of_group, metadata)
 
 
-def make_initializer(model: Model, program: Program, data: Observations) -> AbstractInitializer:
+def make_initializer(program: Program, data: Observations) -> AbstractInitializer:
     """The initializer that the layout of a capture calls for."""
     groups = find_groups(program, data)
-    group_model = None if groups is None else find_group_model(model, groups, data)
+    group_model = None if groups is None else find_group_model(program.model, groups, data)
     if groups is None or group_model is None:
         return JointInitializer(program, find_coefficients(program, data))
     return HierarchicalInitializer(group_model, HierarchicalReparam(program, groups))

@@ -17,19 +17,11 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.compiled_model import CompiledModel, compile_model
 from polar_bayes.inference.initialization import AbstractInit
 from polar_bayes.inference.program import Draw, Program, Values, in_blocks, keys_of_draws
-from polar_bayes.inference.request import Request, is_padded
+from polar_bayes.inference.request import Request
 from polar_bayes.numerics.compile import TRACING_LOCK
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.priors import RANGES, describe_prior, support_bounds
 from polar_bayes.progress import Progress, no_progress
-
-
-@dataclasses.dataclass
-class _ModeSearch:
-    """What a problem's search for modes has found so far."""
-
-    found: AbstractInit | None = None
-    seconds: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -51,7 +43,10 @@ class Problem:
     data: Observations
     key: Array
     start_time: float = dataclasses.field(default_factory=time.perf_counter)
-    _search: _ModeSearch = dataclasses.field(default_factory=_ModeSearch, init=False, repr=False)
+    _searched: list[tuple[AbstractInit, float]] = dataclasses.field(
+        default_factory=list, init=False, repr=False
+    )
+    """What the search for modes has found, once it has, and how long it took."""
 
     @property
     def program(self) -> Program:
@@ -66,7 +61,7 @@ class Problem:
     @property
     def search_seconds(self) -> float:
         """Time that the search for modes took; 0 where no method has asked for it."""
-        return self._search.seconds
+        return self._searched[0][1] if self._searched else 0.0
 
     @property
     def is_one_spectrum_point(self) -> bool:
@@ -85,13 +80,11 @@ class Problem:
         Raises:
             FitError: No start reached a mode.
         """
-        if self._search.found is None:
+        if not self._searched:
             begun = time.perf_counter()
-            find = self.compiled_model.initializer.find
-            found = find(self.data, self.key, progress)
-            self._search.seconds = time.perf_counter() - begun
-            self._search.found = found
-        return self._search.found
+            found = self.compiled_model.initializer.find(self.data, self.key, progress)
+            self._searched.append((found, time.perf_counter() - begun))
+        return self._searched[0][0]
 
     def describe(self) -> pd.DataFrame:
         """What is estimated, and from which readings.
@@ -211,7 +204,7 @@ def observe_request(request: Request, *, padded: bool = False) -> Observations:
 
 def compile_request(request: Request) -> tuple[CompiledModel, Observations]:
     """The compiled model of a request, from the cache, and its capture."""
-    data = observe_request(request, padded=is_padded(request.model, request.scene, request.links))
+    data = observe_request(request, padded=request.is_padded)
     compiled_model = compile_model(request, data)
     return compiled_model, compiled_model.free(data)
 

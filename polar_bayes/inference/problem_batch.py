@@ -1,15 +1,30 @@
 """Captures of one layout that are fitted together, and what methods find for them."""
 
+import contextlib
 import dataclasses
-from typing import NamedTuple
+import os
+from collections.abc import Callable, Hashable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status
 from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.program import Values
-from polar_bayes.numerics.batches import AnyArray
+from polar_bayes.numerics.batches import AnyArray, batches, map_batches
+from polar_bayes.numerics.compile import JitOnce
+
+BATCH = 128
+"""Captures that one call of a program takes."""
+
+SMALL_BATCH = 4
+"""The same where each has particles of its own."""
+
+_THREADS = ThreadPoolExecutor(os.cpu_count() or 1, "polar_bayes batches")
+"""That run batches of all images at once: a core is not shared by two."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -37,6 +52,60 @@ class ProblemBatch:
         """Some of the captures, in that order."""
         pixels, keys, at = self.pixels.subset(index), self.keys[index], self.at[index]
         return dataclasses.replace(self, pixels=pixels, keys=keys, at=at)
+
+    def run[S: Hashable](
+        self,
+        make: Callable[[CompiledModel, S], JitOnce],
+        settings: S,
+        *states: Any,
+        given: tuple = (),
+        batch: int = BATCH,
+        single: bool = False,
+    ) -> Any:
+        """Run a program on all captures; `given` arguments are the same for all of them."""
+        double = not single and self.engine.dtype == np.float64
+        with self._arguments(states, given, batch, single=single) as arguments:
+            program, device = self.engine.made(make, settings), jax.config.jax_default_device
+            if not program.is_begun:  # a thread that was abandoned must not trace in another one
+                program.program(*arguments(next(batches(len(self), batch))))
+
+            def of_batch(index: np.ndarray) -> Any:
+                with jax.enable_x64(double), jax.default_device(device):  # no thread inherits them
+                    return program(*arguments(index))
+
+            threads = _THREADS.map if len(self) > batch else map
+            return map_batches(of_batch, len(self), batch, threads)
+
+    def begin[S: Hashable](
+        self,
+        make: Callable[[CompiledModel, S], JitOnce],
+        settings: S,
+        *states: Any,
+        given: tuple = (),
+        single: bool = False,
+    ) -> None:
+        """Begin to compile what `run` needs, in parallel with what follows, given one state."""
+        program = self.engine.made(make, settings)
+        if not program.is_begun:
+            with self._arguments(states, given, BATCH, single=single) as arguments:
+                program.begin(*arguments(np.zeros(BATCH, int)))
+
+    @contextlib.contextmanager
+    def _arguments(
+        self, states: tuple, given: tuple, batch: int, *, single: bool
+    ) -> Iterator[Callable[[np.ndarray], tuple]]:
+        """The arguments of a program for the captures of a batch, in its precision."""
+        dtype = np.float32 if single else self.engine.dtype
+        with jax.enable_x64(dtype == np.float64):
+            pixels = self.pixels.in_precision(dtype)
+            static = jax.tree.map(jnp.asarray, pixels.static)
+
+            def arguments(index: np.ndarray) -> tuple:
+                wanted = np.int32(min(batch, len(self) - index[0]))
+                state = jax.tree.map(lambda x: x[index], states)
+                return (*given, wanted, pixels.take(index), static, *state)
+
+            yield arguments
 
 
 def problem_batch(
@@ -67,18 +136,17 @@ class BatchDraws(NamedTuple):
     mode: tuple[AnyArray, AnyArray] | None = None
 
 
-class Outcome(NamedTuple):
+class Outcome:
     """Diagnostics of the captures of a batch, entered as they are found: NaN where there are none.
 
     Those of the search for modes and of the first proposal stay where a later one gives the answer.
     """
 
-    pareto_k: np.ndarray
-    ess: np.ndarray
-    condition: np.ndarray
-    steps: np.ndarray
-    method: np.ndarray
-    status: np.ndarray
+    def __init__(self, count: int, status: Status = Status.NOT_CONVERGED) -> None:
+        self.pareto_k, self.ess, self.condition = np.full((3, count), np.nan)
+        self.steps = np.zeros(count, np.int32)
+        self.method = np.full(count, MethodUsed.NONE, np.int8)
+        self.status = np.full(count, status, np.int8)
 
     def put(self, found: BatchDraws) -> None:
         """Enter what was found for some captures."""
@@ -88,18 +156,6 @@ class Outcome(NamedTuple):
         self.steps[at] += found.steps
         for own, new in ((self.pareto_k, found.pareto_k), (self.condition, found.condition)):
             own[at] = np.where(np.isnan(own[at]), new, own[at])
-
-
-def empty_outcome(count: int, status: Status = Status.NOT_CONVERGED) -> Outcome:
-    """Diagnostics of captures that are not fitted yet."""
-    return Outcome(
-        pareto_k=np.full(count, np.nan),
-        ess=np.full(count, np.nan),
-        condition=np.full(count, np.nan),
-        steps=np.zeros(count, np.int32),
-        method=np.full(count, MethodUsed.NONE, np.int8),
-        status=np.full(count, status, np.int8),
-    )
 
 
 def random_keys(seed: int, numbers: np.ndarray) -> np.ndarray:

@@ -24,11 +24,10 @@ from numpyro.infer.util import compute_log_probs
 from numpyro.primitives import Messenger
 
 from polar_bayes.errors import FitError
+from polar_bayes.inference.model_parts import ModelParts
 from polar_bayes.numerics.batches import AnyArray, map_batches
 from polar_bayes.numerics.compile import JitOnce, compiled
 from polar_bayes.observation.data import Observations
-from polar_bayes.observation.links import AbstractLink
-from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import PriorTable, check_support
 
 Model = Callable[[Observations], None]
@@ -337,7 +336,7 @@ def in_blocks(function: JitOnce, rows: tuple[np.ndarray, ...], given: Any) -> An
     return map_batches(of_block, len(rows[0]), BLOCK, over)
 
 
-def _raveled(like: dict[str, jax.ShapeDtypeStruct]) -> tuple[jax.ShapeDtypeStruct, Callable]:
+def raveled(like: dict[str, jax.ShapeDtypeStruct]) -> tuple[jax.ShapeDtypeStruct, Callable]:
     """The vector of sites of these shapes, and the function that takes it apart."""
     functions: list[Callable] = []
 
@@ -388,7 +387,7 @@ def compile_program(model: Model, data: Observations) -> Program:
         name: jax.eval_shape(dist.biject_to(supports[name]).inv, site["value"])
         for name, site in latent.items()
     }
-    flat, unravel = _raveled(prototype)
+    flat, unravel = raveled(prototype)
     plates = {name: site["cond_indep_stack"] for name, site in (sampled | derived).items()}
     return Program(
         model=model,
@@ -482,18 +481,14 @@ class ModelInfo(NamedTuple):
     fixed: dict[str, object]
 
 
-def inspect_model(
-    model: Callable,
-    data: Observations,
-    scene: Scene,
-    priors: PriorTable,
-    links: Mapping[str, AbstractLink],
-) -> ModelInfo:
+def inspect_model(parts: ModelParts, data: Observations) -> ModelInfo:
     """Trace a model once with abstract arrays; a `FitError` where it cannot be fitted."""
-    _, sampled, latent = _abstract_sites(model, data, scene=scene, priors=priors, links=links)
+    priors = PriorTable(parts.priors)
+    given = {"scene": parts.scene, "priors": priors, "links": parts.links}
+    _, sampled, latent = _abstract_sites(parts.model, data, **given)
     for name, site in latent.items():
         _check_site(name, site["fn"])
-    _check_handlers(model, tuple(sampled))
+    _check_handlers(parts.model, tuple(sampled))
     _check_readings(sampled, data)
     return ModelInfo(
         priors=priors.read,

@@ -12,23 +12,20 @@ from numpyro.primitives import Messenger
 
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, FitError
-from polar_bayes.inference.cache_key import cache_key, layout_of
+from polar_bayes.inference.model_parts import ModelParts, layout_of
 from polar_bayes.inference.program import ModelInfo, inspect_model
 from polar_bayes.inference.result import Provenance
 from polar_bayes.models.gp_spectral import gp_spectral
 from polar_bayes.models.hierarchical import Hierarchical
 from polar_bayes.models.per_material import per_material
 from polar_bayes.numerics.compile import TRACING_LOCK, LRUCache
-from polar_bayes.numerics.fingerprint import uses_own_code
-from polar_bayes.observation.data import Observations, observe
+from polar_bayes.observation.data import observe
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.surface import SmoothSurface
 from polar_bayes.priors import (
     PRIORS,
-    NormalCoordinate,
     PriorTable,
-    cast_prior,
     prior_text,
     resolve_priors,
 )
@@ -44,29 +41,21 @@ _MODEL_INFO: LRUCache[ModelInfo] = LRUCache(32)
 
 
 @dataclasses.dataclass(frozen=True)
-class Request:
+class Request(ModelParts):
     """A capture, a model and all that fixes its posterior, with every default filled in."""
 
     capture: xr.Dataset
-    model: Callable
     model_name: str
-    scene: Scene
     scene_name: str
     scene_chosen_by: str
-    priors: dict[str, dist.Distribution]
     declared: dict[str, str]
     fixed: dict[str, object]
-    links: dict[str, AbstractLink]
     swapped: tuple[str, ...]
     largest_view_zenith: float
     seed: int
     precision: str
     shared: tuple[str, ...]
     """Parameters of the set-up that the pixels of an image share by default."""
-
-    def bind(self, scene: Scene) -> Callable[[Observations], None]:
-        """The model with everything but its data in place."""
-        return bind_model(self.model, scene, self.priors, self.links)
 
     def describe(self) -> Provenance:
         """The request in what JSON can hold, for the provenance of a result."""
@@ -79,38 +68,6 @@ class Request:
             "links": {name: repr(link) for name, link in self.links.items()},
             "seed": self.seed,
         }
-
-
-def bind_model(
-    model: Callable,
-    scene: Scene,
-    priors: Mapping[str, dist.Distribution],
-    links: Mapping[str, AbstractLink],
-) -> Callable[[Observations], None]:
-    """A model with everything but its data in place, in the precision that is switched on."""
-    own = {name: cast_prior(prior) for name, prior in priors.items()}
-    return functools.partial(_run, model=model, scene=scene, priors=own, links=links)
-
-
-def _run(
-    data: Observations,
-    model: Callable,
-    scene: Scene,
-    priors: dict[str, dist.Distribution],
-    links: Mapping[str, AbstractLink],
-) -> None:
-    """The model, with priors from other pixels in the place of those that they replace."""
-    shared = {
-        name: NormalCoordinate(mean, sd, priors[name].support)
-        for name, (mean, sd) in data.shared.items()
-    }
-    model(data, scene=scene, priors={**priors, **shared}, links=links)
-
-
-def is_padded(model: Callable, scene: Scene, links: Mapping[str, AbstractLink]) -> bool:
-    """Whether captures with other numbers of views may share the programs of a model."""
-    # Code of the user's own need not mask what is not valid, so it is given no padding.
-    return not uses_own_code(model, scene, links)
 
 
 def resolve(
@@ -151,17 +108,18 @@ def resolve(
     _check_settings(limit, precision, seed)
     _check_views(capture, limit)
     function = model if callable(model) else _find_model(model)
-    stated = {} if priors is None else priors
-    own: dict[str, dist.Distribution] = {}
-    if isinstance(stated, Mapping):  # anything else is refused where the priors are read
-        usual = default_priors(setup, capture, known)
-        same = {n: x for n, x in {**PRIORS, **usual}.items() if _are_same(stated.get(n), x)}
-        own = {name: prior for name, prior in stated.items() if name not in same}
-        stated = {**usual, **own, **same}
+    PriorTable(priors)  # refuses what names no priors
+    given = dict(priors or {})
+    usual = default_priors(setup, capture, known)
+    same = {n: x for n, x in {**PRIORS, **usual}.items() if _are_same(given.get(n), x)}
+    own = {name: prior for name, prior in given.items() if name not in same}
+    stated = {**usual, **own, **same}
+    parts = ModelParts(function, setup.scene, stated, chosen)
     with jax.enable_x64(precision == "double"):
-        padded = is_padded(function, setup.scene, chosen)
-        data = observe(capture, largest_view_zenith=limit, padded=padded)
-        found = _inspect(function, data, setup.scene, stated, chosen)
+        data = observe(capture, largest_view_zenith=limit, padded=parts.is_padded)
+        with TRACING_LOCK:
+            key = parts.key(layout_of(data))
+            found = _MODEL_INFO.of(key, lambda: inspect_model(parts, data))
     swapped = {
         "scene": scene_name == "custom",
         "model": callable(model),
@@ -178,7 +136,7 @@ def resolve(
         scene_chosen_by=chosen_by,
         priors=resolve_priors(
             found.priors,
-            {n: prior for n, prior in stated.items() if n in found.priors or n in (priors or {})},
+            {n: prior for n, prior in stated.items() if n in found.priors or n in given},
         ),
         declared=found.declared,
         fixed=found.fixed,
@@ -232,20 +190,6 @@ def _find_model(name: object) -> Callable:
             "no such model", where=f"model={name!r}", hint=f"give one of {', '.join(MODELS)}"
         )
     return MODELS[name]
-
-
-def _inspect(
-    model: Callable,
-    data: Observations,
-    scene: Scene,
-    priors: Mapping[str, dist.Distribution] | None,
-    links: Mapping[str, AbstractLink],
-) -> ModelInfo:
-    """Sites of the model, from the cache where a capture of that layout was fitted before."""
-    table = PriorTable(priors)
-    key = cache_key(model, scene, priors or {}, links, layout_of(data))
-    with TRACING_LOCK:
-        return _MODEL_INFO.of(key, lambda: inspect_model(model, data, scene, table, links))
 
 
 def _name_of(model: Callable) -> str:

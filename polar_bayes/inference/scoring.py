@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
-from numpyro.infer.util import compute_log_probs
 
 from polar_bayes.inference.program import Program
 from polar_bayes.numerics.levenberg_marquardt import MAX_UNROLLED, Derivatives, derivatives
@@ -108,11 +107,7 @@ class _Pixel:
         return jax.tree.unflatten(tree, whole).log_prob(value)
 
     def _observed(self, coordinates: Coordinates) -> list[tuple[dist.Distribution, Array]]:
-        latent = {
-            name: dist.biject_to(self._program.supports[name])(value)
-            for name, value in self._sites(coordinates).items()
-        }
-        _, trace = compute_log_probs(self._program.model, (self._data,), {}, latent)
+        trace = self._program.trace_at(self._sites(coordinates), self._data)
         return [(trace[name]["fn"], trace[name]["value"]) for name in self._program.observed]
 
     def _sites(self, coordinates: Coordinates) -> dict[str, Array]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from numpyro import distributions as dist
 
-from polar_bayes.inference.batching import ObservationBatch, Status
+from polar_bayes.inference.batching import Status
 from polar_bayes.inference.checks import (
     CARRIES,
     CAUTION,
@@ -28,10 +28,10 @@ from polar_bayes.inference.checks import (
 )
 from polar_bayes.inference.compiled_model import MOMENTS, CompiledModel
 from polar_bayes.inference.prior_probability import has_probabilities, probability_below
-from polar_bayes.inference.problem_batch import BatchDraws
+from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
 from polar_bayes.inference.program import Values
 from polar_bayes.inference.result import CENTRAL_95
-from polar_bayes.maps.residuals import Fitted, direction_kernels, fitted_readings, residual_tail
+from polar_bayes.maps.residuals import direction_kernels, fitted_readings, residual_tail
 from polar_bayes.numerics.psis import LEVELS, Marginals
 from polar_bayes.observation.links import PERFECT
 from polar_bayes.physics.part import absence
@@ -73,57 +73,32 @@ class Scalar:
         return found[(slice(None),) * (found.ndim - len(self.index)) + self.index]
 
 
-@dataclasses.dataclass(frozen=True)
-class Bound:
-    """An end of the support of a scalar at which little of the prior is."""
-
-    scalar: Scalar
-    value: float
+Bound = tuple[Scalar, float]
+"""An end of the support of a scalar at which little of the prior is."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Criteria:
-    """What is checked in each pixel of one model.
+    """What is checked in each pixel of one model, by names and sizes of what has a map."""
 
-    Args:
-        priors: By parameter.
-        judged: Scalars with a prior probability that are no noise.
-        ends: Where each of them is absent or perfect, as `tail_scores` has it.
-        noise: Scalars of the noise with a prior probability.
-        noise_ends: Where each of them is perfect.
-        material: Numbers of the material, which others of `judged` may carry.
-        bounds: Of all scalars.
-        kernels: How near the directions of views are.
-    """
-
-    priors: Mapping[str, dist.Distribution]
-    judged: tuple[Scalar, ...]
-    ends: np.ndarray
-    noise: tuple[Scalar, ...]
-    noise_ends: np.ndarray
-    material: tuple[Scalar, ...]
-    bounds: tuple[Bound, ...]
-    kernels: list[np.ndarray]
-
-
-def criteria(engine: CompiledModel, sizes: tuple[tuple[str, tuple[int, ...]], ...]) -> Criteria:
-    """The criteria of the parameters that have a map, by their names and sizes."""
-    priors = engine.priors
-    every = [scalar for name, own in sizes for scalar in _scalars(name, own)]
-    known = {n for n, x in priors.items() if not x.batch_shape and has_probabilities(x)}
-    stated = [each for each in every if each.name in known]
-    judged = tuple(each for each in stated if each.name not in PERFECT)
-    noise = tuple(each for each in stated if each.name in PERFECT)
-    return Criteria(
-        priors=priors,
-        judged=judged,
-        ends=np.array([_end(each.name, priors[each.name]) for each in judged]),
-        noise=noise,
-        noise_ends=np.array([_end(each.name, priors[each.name]) for each in noise]),
-        material=tuple(each for each in every if each.name in MATERIAL_PARAMETERS),
-        bounds=tuple(_bounds(engine, priors, every)),
-        kernels=direction_kernels(engine.layout.geometry),
-    )
+    def __init__(
+        self, engine: CompiledModel, sizes: tuple[tuple[str, tuple[int, ...]], ...]
+    ) -> None:
+        self.priors = priors = engine.priors
+        every = [scalar for name, own in sizes for scalar in _scalars(name, own)]
+        known = {n for n, x in priors.items() if not x.batch_shape and has_probabilities(x)}
+        stated = [each for each in every if each.name in known]
+        # Scalars with a prior probability, those of the noise apart; and where each is absent or
+        # perfect, as `tail_scores` has it.
+        self.judged = tuple(each for each in stated if each.name not in PERFECT)
+        self.noise = tuple(each for each in stated if each.name in PERFECT)
+        self.ends, self.noise_ends = (
+            np.array([_end(each.name, priors[each.name]) for each in some])
+            for some in (self.judged, self.noise)
+        )
+        # Numbers of the material, which others of `judged` may carry.
+        self.material = tuple(each for each in every if each.name in MATERIAL_PARAMETERS)
+        self.bounds = tuple(_bounds(engine, priors, every))
+        self.kernels = direction_kernels(engine.layout.geometry)
 
 
 def _scalars(name: str, own: tuple[int, ...]) -> list[Scalar]:
@@ -152,7 +127,7 @@ def _bounds(
                 strip = NEAR_BOUND * np.diff(np.quantile(draws, CENTRAL_95))
                 weights = np.full((1, MOMENTS), 1.0 / MOMENTS)
                 if _share_at(bound, draws, weights, strip) < MASS_AT_BOUND:
-                    yield Bound(scalar, bound)
+                    yield scalar, bound
 
 
 def _share_at(
@@ -165,13 +140,11 @@ def _share_at(
 class PixelCriticism:
     """The checks of the pixels of a block, filled in as answers come: marginals first."""
 
-    def __init__(
-        self, engine: CompiledModel, pixels: ObservationBatch, marginals: Marginals
-    ) -> None:
-        self._engine, self._pixels, self._marginals = engine, pixels, marginals
+    def __init__(self, batch: ProblemBatch, marginals: Marginals) -> None:
+        self._batch, self._marginals, engine = batch, marginals, batch.engine
         sizes = tuple((name, x.shape[1:]) for name, x in marginals.mean.items())
-        self._checks = checks = engine.made(criteria, sizes)
-        count, size = len(pixels), engine.program.size
+        self._checks = checks = engine.made(Criteria, sizes)
+        count, size = len(batch), engine.program.size
         self._mode = np.full((count, size), np.nan), np.full((count, size, size), np.nan)
         self._at_bound = np.zeros(count, bool)
         self._carries = np.ones((count, len(checks.judged)), bool)
@@ -194,13 +167,14 @@ class PixelCriticism:
         self, bound: Bound, at: np.ndarray, parameters: Values, weights: np.ndarray
     ) -> None:
         """Which pixels lie against a bound."""
-        quantiles = bound.scalar.of(self._marginals.quantiles)[:, at]
+        scalar, value = bound
+        quantiles = scalar.of(self._marginals.quantiles)[:, at]
         strip = NEAR_BOUND * (quantiles[HIGHEST] - quantiles[LOWEST])
-        gap = np.min(np.abs(quantiles[[LOWEST, HIGHEST]] - bound.value), axis=0)
+        gap = np.min(np.abs(quantiles[[LOWEST, HIGHEST]] - value), axis=0)
         near = np.flatnonzero(gap < 2.0 * strip)  # of the others, no more than 2.5% can be there
         if near.size:
-            draws = bound.scalar.of(parameters)[near]
-            share = _share_at(bound.value, draws, weights[near], strip[near])
+            draws = scalar.of(parameters)[near]
+            share = _share_at(value, draws, weights[near], strip[near])
             self._at_bound[at[near]] |= share >= MASS_AT_BOUND
 
     def _find_carriers(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
@@ -269,23 +243,21 @@ class PixelCriticism:
         for some in np.array_split(known, range(PIXELS, known.size, PIXELS)):
             fitted = self._fitted(good[some])
             if fitted is not None:
-                kernels = self._checks.kernels
-                tails[some] = residual_tail(fitted, kernels, factor[good[some]])
+                tails[some] = residual_tail(*fitted, self._checks.kernels, factor[good[some]])
         return tails
 
     def begin_compiling(self) -> None:
         """Compile what residuals need, in parallel with what follows."""
-        names, mode = self._engine.program.observed, [np.float32(x[:1]) for x in self._mode]
-        self._engine.begin(fitted_readings, names, self._pixels, *mode, single=True)
+        names, mode = self._batch.engine.program.observed, [np.float32(x[:1]) for x in self._mode]
+        self._batch.begin(fitted_readings, names, *mode, single=True)
 
-    def _fitted(self, at: np.ndarray) -> Fitted | None:
-        """Readings of some pixels at their modes; None where no distribution is known."""
+    def _fitted(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Scores and changes of readings at their modes; None where no distribution is known."""
         if not at.size:
             return None
-        engine, pixels = self._engine, self._pixels.subset(at)
-        modes = [np.float32(x[at]) for x in self._mode]
-        found = engine.run(fitted_readings, engine.program.observed, pixels, *modes, single=True)
-        valid = np.asarray(pixels.batched.valid)
+        batch, modes = self._batch.subset(at), [np.float32(x[at]) for x in self._mode]
+        found = batch.run(fitted_readings, batch.engine.program.observed, *modes, single=True)
+        valid = np.asarray(batch.pixels.batched.valid)
         views, scores, changes = valid.shape[-1], [], []
         for standard, jacobian in found.values():
             if np.shape(jacobian)[:-1] == valid.shape:  # one number for each reading
@@ -294,7 +266,7 @@ class PixelCriticism:
                 changes.append(jacobian.reshape(at.size, -1, views, jacobian.shape[-1]))
         if not scores:
             return None
-        return Fitted(*(np.concatenate(x, axis=1) for x in (scores, changes)))
+        return np.concatenate(scores, axis=1), np.concatenate(changes, axis=1)
 
 
 def _flags(p_value: np.ndarray, check: str) -> np.ndarray:

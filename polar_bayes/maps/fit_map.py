@@ -19,13 +19,12 @@ from polar_bayes.inference.batching import (
     IMAGE,
     MIN_VIEWS,
     MethodUsed,
-    ObservationBatch,
     Status,
     batch_pixels,
     cut,
 )
 from polar_bayes.inference.compiled_model import CompiledModel, compile_layout, layout_key
-from polar_bayes.inference.problem_batch import Outcome, ProblemBatch, empty_outcome, problem_batch
+from polar_bayes.inference.problem_batch import Outcome, ProblemBatch, problem_batch
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.maps.blocks import as_completed, workers
@@ -166,10 +165,12 @@ class MapPlan:
         scores = [functools.partial(each.scores, priors[each.name]) for each in self.shared]
         return Marginals(count, self.sizes, scores=scores)
 
-    def pixels(self, image: xr.Dataset) -> ObservationBatch:
-        """The pixels of an image, or of a block of it, row by row."""
+    def batch(self, image: xr.Dataset, numbers: np.ndarray | None = None) -> ProblemBatch:
+        """The pixels of an image, or of a block, row by row; `numbers` are theirs in the whole."""
         with jax.enable_x64(True):
-            return batch_pixels(self.observe(validate(image)), self.own_directions)
+            pixels = batch_pixels(self.observe(validate(image)), self.own_directions)
+        every = np.arange(len(pixels)) if numbers is None else numbers
+        return problem_batch(self.engine, pixels, every, self.request.seed)
 
     @property
     def engine(self) -> CompiledModel:
@@ -248,11 +249,10 @@ def _check_shared(names: Sequence[str], request: Request) -> None:
 def _with_shared(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
     """The plan with the posterior of what pixels share, from some of them drawn at random."""
     request, settings = plan.request, plan.settings
-    pixels = plan.pixels(_random_pixels(capture, request.seed, SHARED_PIXELS))
+    batch = plan.batch(_random_pixels(capture, request.seed, SHARED_PIXELS))
     method = settings if isinstance(settings, CorrectedLaplace) else CorrectedLaplace()
-    given = plan.engine, pixels, method, request.priors, plan.shared, request.seed
     try:
-        found = estimate_shared(*given)
+        found = estimate_shared(batch, method, request.priors, plan.shared)
     except FitError as error:
         if not plan.shares_by_default:
             raise
@@ -273,9 +273,7 @@ def _with_settings(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
     """The plan with the settings that the image calls for."""
 
     def sample(count: int) -> ProblemBatch:
-        seed = plan.request.seed
-        pixels = plan.pixels(_random_pixels(capture, seed, count))
-        return problem_batch(plan.engine, pixels, np.arange(len(pixels)), seed)
+        return plan.batch(_random_pixels(capture, plan.request.seed, count))
 
     size = capture.sizes["y"] * capture.sizes["x"]
     settings, found = plan.settings.for_image(size, sample, is_shared=bool(plan.shared))
@@ -380,7 +378,7 @@ def with_pixel_numbers(image: xr.Dataset, region: Mapping[str, slice] | None = N
 def blank(capture: xr.Dataset, plan: MapPlan) -> xr.Dataset:
     """Maps of the image without values: names, axes, types and attributes; lazy (Dask)."""
     corner = capture.isel({dim: slice(1) for dim in IMAGE})
-    nothing, unknown = empty_outcome(1, Status.NOT_FITTED), np.full(1, UNKNOWN, np.int8)
+    nothing, unknown = Outcome(1, Status.NOT_FITTED), np.full(1, UNKNOWN, np.int8)
     tiny = maps_of(plan.marginals(1), nothing, unknown, corner, plan)
     tiny = tiny.drop_vars(IMAGE, errors="ignore")
     sizes = dict(tiny.sizes) | {dim: capture.sizes[dim] for dim in IMAGE}
@@ -422,11 +420,11 @@ def fit_block(block: xr.Dataset, plan: MapPlan) -> xr.Dataset:
     found = plan.marginals(numbers.size)
     readings = mask_missing(block.drop_vars(NUMBER))
     if not readings["valid"].any():  # a corner of a picture; as a capture it would be refused
-        nothing = empty_outcome(numbers.size, Status.MASKED)
+        nothing = Outcome(numbers.size, Status.MASKED)
         return maps_of(found, nothing, np.zeros(numbers.size, np.int8), block, plan)
-    batch = problem_batch(plan.engine, plan.pixels(readings), numbers, plan.request.seed)
-    criticism = PixelCriticism(batch.engine, batch.pixels, found)
-    outcome = empty_outcome(len(batch))
+    batch = plan.batch(readings, numbers)
+    criticism = PixelCriticism(batch, found)
+    outcome = Outcome(len(batch))
     criticism.begin_compiling()
     for part in plan.settings.fit_batch(batch):
         outcome.put(part)

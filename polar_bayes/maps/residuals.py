@@ -97,7 +97,6 @@ class Reading(NamedTuple):
 @functools.singledispatch
 def standardize(noise: dist.Distribution, value: Array) -> Reading | None:
     """A reading by the distribution of its noise, inside a program; None where it is not known."""
-    del noise, value
     return None
 
 
@@ -155,15 +154,6 @@ def _by_distance(
     return Reading(Distance(distance, freedom, low, high), center, scale / jnp.sqrt(share))
 
 
-class Fitted(NamedTuple):
-    """Readings of many pixels at their modes."""
-
-    scores: Float[np.ndarray, "pixel group view"]
-    """NaN where there is no reading."""
-    changes: Float[np.ndarray, "pixel group view size"]
-    """Change of each noise-free reading with one posterior sd, in units of its noise."""
-
-
 def fitted_readings(engine: CompiledModel, names: tuple[str, ...]) -> JitOnce:
     """The program of the readings of one pixel at its mode, and of what changes them."""
     program = engine.single_program
@@ -194,16 +184,19 @@ def fitted_readings(engine: CompiledModel, names: tuple[str, ...]) -> JitOnce:
 
 
 def residual_tail(
-    fitted: Fitted, kernels: Sequence[np.ndarray], factor: Float[np.ndarray, " pixel"]
+    scores: Float[np.ndarray, "pixel group view"],
+    changes: Float[np.ndarray, "pixel group view size"],
+    kernels: Sequence[np.ndarray],
+    factor: Float[np.ndarray, " pixel"],
 ) -> Float[np.ndarray, " pixel"]:
     """p-value of residuals as noise after a fit: of neighbors, the largest, and all of them.
 
     `factor` is the true over the stated error of each pixel: where readings scatter less than
     stated, one that keeps to its statement is no outlier. NaN where there are too few readings.
     """
-    known = np.isfinite(fitted.scores) & np.isfinite(fitted.changes).all(axis=-1)
-    basis = _basis(np.where(known[..., None], fitted.changes, 0.0).astype(float))
-    e = np.where(known, fitted.scores, 0.0)
+    known = np.isfinite(scores) & np.isfinite(changes).all(axis=-1)
+    basis = _basis(np.where(known[..., None], changes, 0.0).astype(float))
+    e = np.where(known, scores, 0.0)
     e = e - np.einsum("pgvi,pi->pgv", basis, np.einsum("pgvi,pgv->pi", basis, e))
     left = np.where(known, 1.0 - np.sum(basis**2, axis=-1), 0.0)
     count, freedom = known.sum(axis=(1, 2)), left.sum(axis=(1, 2))

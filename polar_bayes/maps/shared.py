@@ -36,9 +36,9 @@ from numpyro import distributions as dist
 from numpyro.distributions import transforms
 
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batching import LANES, ObservationBatch, Status, batched
+from polar_bayes.inference.batching import LANES, Status, batched
 from polar_bayes.inference.compiled_model import CompiledModel
-from polar_bayes.inference.problem_batch import empty_outcome, problem_batch
+from polar_bayes.inference.problem_batch import Outcome, ProblemBatch
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.methods.corrected_laplace import CorrectedLaplace
 from polar_bayes.numerics.batches import AnyArray, map_elements
@@ -146,12 +146,10 @@ def of_priors(
 
 
 def estimate_shared(
-    engine: CompiledModel,
-    pixels: ObservationBatch,
+    batch: ProblemBatch,
     method: CorrectedLaplace,
     priors: Mapping[str, dist.Distribution],
     shared: Sequence[SharedParameter],
-    seed: int,
 ) -> list[SharedParameter]:
     """The posterior of shared parameters, from the pixels that the method can be trusted in.
 
@@ -168,7 +166,8 @@ def estimate_shared(
         for starts in (1, CorrectedLaplace.most_starts)
     )
     # Compiled while the first modes are searched for.
-    engine.begin(_slopes, names, pixels, np.zeros((1, DRAWS, engine.program.size), engine.dtype))
+    z = np.zeros((1, DRAWS, batch.engine.program.size), batch.engine.dtype)
+    batch.begin(_slopes, names, z)
     modes, is_last = None, False
     for _ in range(MOST_STEPS):
         now = [
@@ -176,7 +175,7 @@ def estimate_shared(
             for each, m, s in zip(shared, mean.tolist(), sd.tolist(), strict=True)
         ]
         searching, are_followed = everywhere if is_last else once, modes is not None
-        found, modes = _expectations(engine, pixels, searching, now, seed, modes)
+        found, modes = _expectations(batch, searching, now, modes)
         count, least = len(found.slope), 32
         if count < least and are_followed:
             modes = None
@@ -263,22 +262,20 @@ def _prior_derivatives(
 
 
 def _expectations(
-    engine: CompiledModel,
-    pixels: ObservationBatch,
+    batch: ProblemBatch,
     method: CorrectedLaplace,
     shared: Sequence[SharedParameter],
-    seed: int,
     modes: np.ndarray | None,
 ) -> tuple[_Expectations, np.ndarray]:
     """What each pixel says about the shared parameters, at the priors that they have now.
 
     The modes, (pixel, size), are where the search begins and where it has ended.
     """
-    static = dataclasses.replace(pixels.static, shared=as_priors(shared))
-    pixels = dataclasses.replace(pixels, static=static)
-    count, size = len(pixels), engine.program.size
-    batch = problem_batch(engine, pixels, np.arange(count), seed)
-    every, outcome = np.zeros((count, DRAWS, size), engine.dtype), empty_outcome(count)
+    static = dataclasses.replace(batch.pixels.static, shared=as_priors(shared))
+    pixels = dataclasses.replace(batch.pixels, static=static)
+    batch, engine = dataclasses.replace(batch, pixels=pixels), batch.engine
+    count, size = len(batch), engine.program.size
+    every, outcome = np.zeros((count, DRAWS, size), engine.dtype), Outcome(count)
     ends = np.zeros((count, size), engine.dtype)
     for found in method.run_batch(batch, modes):
         outcome.put(found)
@@ -287,7 +284,7 @@ def _expectations(
         if found.at.size and found.draws:
             rows, which = np.arange(found.at.size)[:, None], _resampled(found.weights)
             values = {n: np.asarray(found.draws[n])[rows, which] for n in engine.program.supports}
-            every[found.at] = engine.run(_coordinates, None, pixels.subset(found.at), values)
+            every[found.at] = batch.subset(found.at).run(_coordinates, None, values)
     good = np.flatnonzero(outcome.status == Status.GOOD)
     names = tuple(each.name for each in shared)
     if not good.size:
@@ -297,7 +294,7 @@ def _expectations(
     mean = coordinates.mean(axis=1)
     centered = coordinates - mean[:, None]
     covariance = np.einsum("pdi,pdj->pij", centered, centered) / (DRAWS - 1)
-    slope, error, information = engine.run(_slopes, names, pixels.subset(good), z)
+    slope, error, information = batch.subset(good).run(_slopes, names, z)
     return _Expectations(slope, error, information, mean, covariance), ends
 
 
@@ -315,7 +312,7 @@ def _coordinates(engine: CompiledModel, _: None) -> JitOnce:
     """The program of unconstrained vectors of the draws of one pixel."""
 
     def of_pixel(data: Observations, draws: dict[str, Array]) -> Array:
-        del data  # a transform does not depend on readings
+        # A transform does not depend on readings.
         return jax.vmap(engine.program.unconstrain)(draws)
 
     return batched(of_pixel, lanes=LANES)

@@ -15,7 +15,6 @@ Source:
 """
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import scipy.sparse
@@ -76,7 +75,16 @@ def smooth(maps: xr.Dataset, name: str, neighbor_sd: float, *, seed: int = 0) ->
     covariance = np.linalg.inv(np.eye(len(slopes)) + residuals @ slopes.T)
     scores = -covariance @ (residuals @ mean)
     smoothed = solve(precision * mean) + scores @ gains
-    own = _variances(information, differences, precision, solve, seed)
+    random, diagonal, draws = np.random.default_rng(seed), information.diagonal(), 256
+    # A pixel's variance given the others is known; only that of its conditional mean is drawn, with
+    # an error of a few percent at most.
+    squares = np.zeros(precision.size)
+    for _ in range(draws):
+        perturbed = np.sqrt(precision) * random.normal(size=precision.size)
+        perturbed += differences.T @ random.normal(size=differences.shape[0])
+        given_others = solve(perturbed) - perturbed / diagonal
+        squares += given_others**2
+    own = 1.0 / diagonal + squares / draws
     common = np.einsum("kp,kl,lp->p", gains, covariance, gains)
     answer = xr.Dataset()
     for ending, x in (("", smoothed), ("_sd", np.sqrt(own + common))):
@@ -96,24 +104,3 @@ def _differences(is_known: np.ndarray) -> scipy.sparse.csr_array:
     rows, signs = np.repeat(np.arange(len(pairs)), 2), np.tile([1.0, -1.0], len(pairs))
     shape = len(pairs), int(is_known.sum())
     return scipy.sparse.csr_array((signs, (rows, pairs.ravel())), shape=shape)
-
-
-def _variances(
-    information: scipy.sparse.sparray,
-    differences: scipy.sparse.sparray,
-    precision: np.ndarray,
-    solve: Callable[[np.ndarray], np.ndarray],
-    seed: int,
-    draws: int = 256,
-) -> np.ndarray:
-    """Diagonal of the inverse of the information matrix."""
-    random, diagonal = np.random.default_rng(seed), information.diagonal()
-    # A pixel's variance given the others is known; only that of its conditional mean is drawn, with
-    # an error of a few percent at most.
-    squares = np.zeros(precision.size)
-    for _ in range(draws):
-        perturbed = np.sqrt(precision) * random.normal(size=precision.size)
-        perturbed += differences.T @ random.normal(size=differences.shape[0])
-        given_others = solve(perturbed) - perturbed / diagonal
-        squares += given_others**2
-    return 1.0 / diagonal + squares / draws

@@ -22,12 +22,6 @@ from polar_bayes.numerics.mcse import LARGEST_R_HAT, draws_needed, largest_error
 from polar_bayes.numerics.psis import MAX_PARETO_K, max_effective_size
 from polar_bayes.progress import Progress
 
-RESERVE = 8
-"""Times as many weighted draws as normal posteriors need: long tails need more."""
-
-MOST_DRAWS = 2**17
-"""Weighted draws beyond which chains are the better way."""
-
 MARGIN, MOST_TIMES = 1.5, 16.0
 """Draws of a second try: more than the first error asks for, but not above so many times."""
 
@@ -88,7 +82,9 @@ class Auto(AbstractMethod):
         chains = Nuts(ess=max(450.0, float(needed)), most_draws=max(4000, 4 * needed))
         if not problem.is_one_spectrum_point:
             return {"nuts": chains}
-        weighted = Importance(draws=max(2048, 2 * min(RESERVE * needed, MOST_DRAWS)), rounds=1)
+        # Long tails need more weighted draws than normal posteriors; beyond so many chains are the
+        # better way.
+        weighted = Importance(draws=max(2048, 2 * min(8 * needed, 2**17)), rounds=1)
         if max_effective_size(weighted.draws) < needed:
             return {"nuts": chains}
         return {"importance": weighted, "nuts": chains}
@@ -100,11 +96,28 @@ class Auto(AbstractMethod):
         best: tuple[Attempt, PosteriorDraws] | None = None
         waiting = list(self.candidates(problem).items())
         tried: set[str] = set()
+
+        def attempted(
+            name: str, method: AbstractMethod, until: float
+        ) -> tuple[Attempt, PosteriorDraws | None]:
+            """One method, judged by its own diagnostics, or abandoned at the deadline."""
+            begin = time.perf_counter()
+
+            def judged(progress: Progress) -> tuple[Attempt, PosteriorDraws]:
+                begin = time.perf_counter()
+                draws = method.run(problem, key, progress)
+                return self._judge(name, draws, problem, begin), draws
+
+            try:
+                return run_until(until, progress, judged)
+            except (FitError, OutOfTimeError) as failure:
+                return Attempt(name, time.perf_counter() - begin, why=str(failure)), None
+
         while waiting:
             name, method = waiting.pop(0)
             # The first one always ends: there is nothing else to return.
             until = deadline if attempts else np.inf
-            attempt, draws = self._try(name, method, problem, key, progress, until)
+            attempt, draws = attempted(name, method, until)
             attempts.append(attempt)
             # Of two in doubt the more expensive one is nearer to exact.
             if draws is not None and (best is None or attempt.error <= best[0].error):
@@ -117,13 +130,7 @@ class Auto(AbstractMethod):
                 # Powers of two: of a layout, few numbers of draws are ever compiled.
                 more = method.scale_draws(min(2.0 ** math.ceil(math.log2(times)), MOST_TIMES))
                 waiting[:0] = [] if more is None else [(name, more)]
-        if best is None:
-            raise FitError(
-                "; ".join(f"{attempt.name}: {attempt.why}" for attempt in attempts),
-                where="method='auto'",
-                hint="give more seconds, or check the capture against the prior predictive",
-            )
-        return self._report(*best, attempts)
+        return self._report(best, attempts)
 
     @override
     def deadline(self, problem: Problem) -> float:
@@ -134,31 +141,9 @@ class Auto(AbstractMethod):
         chosen = self.candidates(problem)[draws.metadata["auto"]["chosen"]]
         return chosen.for_comparison(problem, draws)
 
-    def _try(
-        self,
-        name: str,
-        method: AbstractMethod,
-        problem: Problem,
-        key: Array,
-        progress: Progress,
-        deadline: float,
-    ) -> tuple["Attempt", PosteriorDraws | None]:
-        """One method, judged by its own diagnostics, or abandoned at the deadline."""
-        begin = time.perf_counter()
-
-        def run(progress: Progress) -> tuple[Attempt, PosteriorDraws]:
-            begin = time.perf_counter()
-            draws = method.run(problem, key, progress)
-            return self._judge(name, draws, problem, begin), draws
-
-        try:
-            return run_until(deadline, progress, run)
-        except (FitError, OutOfTimeError) as failure:
-            return Attempt(name, time.perf_counter() - begin, why=str(failure)), None
-
     def _judge(self, name: str, draws: PosteriorDraws, problem: Problem, begin: float) -> "Attempt":
         error = expected_error(draws, problem)
-        doubts = _bias_doubts(draws, problem)
+        doubts = bias_doubts(draws, problem)
         biased = bool(doubts)
         if not error <= self.tolerance:
             doubts.append(f"its Monte Carlo error may be {error:.2g} posterior sd")
@@ -175,9 +160,16 @@ class Auto(AbstractMethod):
         )
 
     def _report(
-        self, attempt: "Attempt", draws: PosteriorDraws, attempts: list["Attempt"]
+        self, best: tuple["Attempt", PosteriorDraws] | None, attempts: list["Attempt"]
     ) -> PosteriorDraws:
         """The draws with what was tried, and a problem where nothing was good enough."""
+        if best is None:
+            raise FitError(
+                "; ".join(f"{attempt.name}: {attempt.why}" for attempt in attempts),
+                where="method='auto'",
+                hint="give more seconds, or check the capture against the prior predictive",
+            )
+        attempt, draws = best
         problems = list(draws.problems)
         if not attempt.taken:
             problems.append(
@@ -217,7 +209,7 @@ class Attempt(NamedTuple):
         return texts | {name: _rounded(getattr(self, name)) for name in numbers}
 
 
-def _bias_doubts(draws: PosteriorDraws, problem: Problem) -> list[str]:
+def bias_doubts(draws: PosteriorDraws, problem: Problem) -> list[str]:
     """Why draws may be biased."""
     doubts = draws.doubts
     if draws.pareto_k > MAX_PARETO_K and not doubts:

@@ -181,9 +181,8 @@ class _Run:
     """One run of `CorrectedLaplace` for some pixels of a batch."""
 
     def __init__(self, settings: CorrectedLaplace, batch: ProblemBatch) -> None:
-        self.settings, self.at = settings, batch.at
-        self.engine, self.pixels = batch.engine, batch.pixels
-        size, draws = self.engine.program.size, settings.draws
+        self.settings, self.batch, self.at = settings, batch, batch.at
+        size, draws = batch.engine.program.size, settings.draws
         self.points = normal_points(draws, size, batch.seed)
         self.student_t = student_t_points(STUDENT_T_FACTOR * draws, size, batch.seed)
         self.rotations = random_rotations(batch.keys, size)
@@ -195,11 +194,11 @@ class _Run:
         """
         starts = self.settings.starts or self.settings.most_starts
         if known is None:
-            ranked = find_starts(self.engine, self.pixels, self.settings.candidates)
+            ranked = find_starts(self.batch, self.settings.candidates)
             self._begin_draws()
         else:
             ranked = known[:, None]
-        search = find_modes_from(self.engine, self.pixels, ranked[:, 0])
+        search = find_modes_from(self.batch, ranked[:, 0])
         found = jax.tree.map(np.array, self._weigh(np.arange(self.at.size), search))
         for start, rank in enumerate(RESTARTS if known is None else (), 2):
             everywhere = start <= starts
@@ -207,7 +206,7 @@ class _Run:
             if not untrusted.size:
                 break
             old, begin = take_rows(found.search, untrusted), ranked[untrusted, rank]
-            new = find_modes_from(self.engine, self.pixels.subset(untrusted), begin, old)
+            new = find_modes_from(self.batch.subset(untrusted), begin, old)
             is_lower = new.mode.value < old.mode.value - SAME_MODE
             is_better = new.converged & (~old.converged | is_lower)
             is_other = old.mode.distance(new.mode.z) > LEAST_DISTANCE  # False where one is NaN
@@ -231,8 +230,7 @@ class _Run:
     ) -> tuple[Values, np.ndarray]:
         """Draws of the proposal of every pixel, and their log importance ratios."""
         states, given = (tuple(np.float32(x) for x in each) for each in (proposal, points))
-        some = self.pixels.subset(which)
-        return self.engine.run(_draws, None, some, *states, given=given, single=True)
+        return self.batch.subset(which).run(_draws, None, *states, given=given, single=True)
 
     def _begin_draws(self) -> None:
         """Compile while modes are searched."""
@@ -240,7 +238,7 @@ class _Run:
         shapes = (1, size), (1, size, size), self.points.z.shape, self.points.log_density.shape
         *states, z, log_density = (np.zeros(shape, np.float32) for shape in shapes)
         given = z, log_density
-        self.engine.begin(_draws, None, self.pixels, *states, given=given, single=True)
+        self.batch.begin(_draws, None, *states, given=given, single=True)
 
     def answers(self, found: Approximation) -> Iterator[BatchDraws]:
         """Normal approximations, corrected by their weights where these can be trusted."""

@@ -26,23 +26,21 @@ from jaxtyping import Array, Float
 
 from polar_bayes.errors import FitError
 from polar_bayes.inference.batch_modes import find_all_modes, find_conditional_modes
-from polar_bayes.inference.batching import MethodUsed, ObservationBatch, Status, batched
+from polar_bayes.inference.batching import MethodUsed, Status, batched
 from polar_bayes.inference.compiled_model import (
     MOMENTS,
-    SMALL_BATCH,
     CompiledModel,
-    evaluate_draws,
 )
 from polar_bayes.inference.problem import Problem
-from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
+from polar_bayes.inference.problem_batch import SMALL_BATCH, BatchDraws, ProblemBatch
 from polar_bayes.inference.program import THREADS, Values, split_key
 from polar_bayes.inference.result import CENTRAL_95, Provenance
 from polar_bayes.methods.method import AbstractBatchMethod, AbstractMethod, PosteriorDraws
 from polar_bayes.methods.profile_mixture import (
     LEAST_WEIGHT,
     MOST_COORDINATES,
+    Components,
     Conditional,
-    Peaks,
     mixture_of,
     profile_components,
     profile_mixture,
@@ -62,13 +60,6 @@ from polar_bayes.numerics.psis import (
 )
 from polar_bayes.observation.data import Observations
 from polar_bayes.progress import Progress, no_progress
-
-SIDE_BY_SIDE = 1024
-"""Draws whose proposal density is computed together: that of all at once would fill the memory."""
-
-
-GROUP = 64
-"""Captures at most whose draws are in memory in each thread."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,7 +136,8 @@ class Importance(AbstractMethod):
         if not batch.engine.initializer.is_plain:
             yield from super().run_batch(batch)
             return
-        count = max(min(THREADS, len(batch)), -(-len(batch) // GROUP))
+        most = 64  # captures whose draws are in memory in each thread
+        count = max(min(THREADS, len(batch)), -(-len(batch) // most))
         groups = [batch.subset(x) for x in np.array_split(np.arange(len(batch)), count)]
         found: list[int] = []
         with ThreadPoolExecutor(THREADS) as pool:
@@ -158,20 +150,19 @@ class Importance(AbstractMethod):
 
     def _run_group(self, batch: ProblemBatch) -> list[BatchDraws]:
         """Weighted draws of the captures that have a mode."""
-        engine, pixels = batch.engine, batch.pixels
-        with jax.enable_x64(engine.precision == "double"):  # a thread does not inherit it
-            owner, modes = find_all_modes(engine, pixels)
+        with jax.enable_x64(batch.engine.precision == "double"):  # a thread does not inherit it
+            owner, modes = find_all_modes(batch)
             if not owner.size:
                 return []
-            mixtures = profile_mixtures(engine, pixels, owner, modes)
+            mixtures = profile_mixtures(batch, owner, modes)
             samples = {
                 row: Rounds(self, mixture, jax.random.wrap_key_data(jnp.asarray(batch.keys[row])))
                 for row, mixture in mixtures.items()
             }
             while left := [row for row, sample in samples.items() if sample.is_open]:
                 z = np.stack([samples[row].draw() for row in left])
-                some = pixels.subset(np.array(left))
-                drawn = engine.run(_densities, self.draws, some, z, batch=SMALL_BATCH)
+                some = batch.subset(np.array(left))
+                drawn = some.run(_densities, self.draws, z, batch=SMALL_BATCH)
                 for at, row in enumerate(left):
                     parameters, log_posterior = jax.tree.map(lambda x, at=at: x[at], drawn)
                     samples[row].weigh(log_posterior, parameters)
@@ -213,17 +204,6 @@ def tail_shares(problem: Problem, parameters: Values, key: Array) -> Provenance:
         shares[name] = np.round(beyond, 5).tolist()
     known = {"pareto_k": found.pareto_k, "ess": found.ess}
     return {"tails": {**known, "shares": shares}}
-
-
-COMPONENTS = 8
-"""Of the mixtures of further rounds."""
-
-ENOUGH_SHARE = 0.2
-"""Effective sample size, as a share of the draws of one round, after which no round follows."""
-
-FITTED_PER_SIZE = 10
-"""Effective draws for each coordinate to which a mixture is fitted: weights that leave fewer are
-raised to a power below 1."""
 
 
 class Rounds:
@@ -278,7 +258,7 @@ class Rounds:
         weights, pareto_k = smooth(log_ratios[None])
         self.weights, self.pareto_k = weights[0], float(pareto_k[0])
         self.effective = float(weighted_ess(weights)[0])
-        enough = self.effective >= ENOUGH_SHARE * self._draws and self.pareto_k <= FINITE_VARIANCE
+        enough = self.effective >= 0.2 * self._draws and self.pareto_k <= FINITE_VARIANCE
         is_last = enough or len(self.proposals) == self._rounds
         self._next = None if is_last or not self.is_finite else self._fit(log_ratios)
 
@@ -306,12 +286,12 @@ class Rounds:
         """A mixture for the next round."""
         self._key, key = split_key(self._key)
         z = self.z
-        weights = _temper(log_ratios, FITTED_PER_SIZE * z.shape[1])
+        weights = _temper(log_ratios, 10 * z.shape[1])  # effective draws that a fit needs
         # One length compiles once: the draws of rounds to come have no weight.
         missing = self._rounds * self._draws - len(z)
         z = np.pad(z, ((0, missing), (0, 0)))
         padded = np.pad(weights, (0, missing)).astype(z.dtype)
-        return _fit_mixture(jnp.asarray(z), jnp.asarray(padded), COMPONENTS, key)
+        return _fit_mixture(jnp.asarray(z), jnp.asarray(padded), 8, key)
 
 
 _fit_mixture = functools.partial(jax.jit, static_argnums=2)(fit_mixture)
@@ -319,9 +299,8 @@ _fit_mixture = functools.partial(jax.jit, static_argnums=2)(fit_mixture)
 
 @jax.jit
 def _log_densities(proposal: Mixture, z: Array) -> Array:
-    return jax.lax.map(
-        lambda z: log_density(proposal, z[None])[0], z, batch_size=min(SIDE_BY_SIDE, len(z))
-    )
+    # Some together: the densities of all components at all draws would fill the memory.
+    return jax.lax.map(lambda z: log_density(proposal, z[None])[0], z, batch_size=min(1024, len(z)))
 
 
 def _temper(log_ratios: np.ndarray, least: float) -> np.ndarray:
@@ -350,7 +329,7 @@ def _propose(proposal: Mixture, count: int, key: Array) -> tuple[Array, Array]:
 
 
 def profile_mixtures(
-    engine: CompiledModel, pixels: ObservationBatch, owner: np.ndarray, modes: NormalApproximation
+    batch: ProblemBatch, owner: np.ndarray, modes: NormalApproximation
 ) -> dict[int, Mixture]:
     """The first proposal of every pixel from its modes, the heaviest of which come first."""
     first, inverse = np.unique(owner, return_index=True, return_inverse=True)[1:]
@@ -360,23 +339,30 @@ def profile_mixtures(
     z, value, root = map(np.asarray, modes[:3])
 
     def conditional(peak: np.ndarray, z: np.ndarray, axis: np.ndarray) -> Conditional:
-        return find_conditional_modes(engine, pixels.subset(owner[peak]), z, axis)
+        return find_conditional_modes(batch.subset(owner[peak]), z, axis)
 
-    peaks = Peaks(z, value, np.swapaxes(root, 1, 2) @ root)
-    prior_sd = finite_sd(engine.prior_draws(MOMENTS))
-    components = profile_components(peaks, np.arange(engine.program.size), prior_sd, conditional)
+    peaks = Components.at(np.arange(len(z)), z, value, np.swapaxes(root, 1, 2) @ root)
+    prior_sd = finite_sd(batch.engine.prior_draws(MOMENTS))
+    components = profile_components(
+        peaks, np.arange(batch.engine.program.size), prior_sd, conditional
+    )
     return {
-        int(pixel): mixture_of(take_rows(components, owner[components.peak] == pixel), engine.dtype)
+        int(pixel): mixture_of(
+            take_rows(components, owner[components.peak] == pixel), batch.engine.dtype
+        )
         for pixel in np.unique(owner)
     }
 
 
 def _densities(engine: CompiledModel, draws: int) -> JitOnce:
-    """The program of parameters and log posterior densities of so many draws of one pixel."""
-    del draws  # programs of other numbers are others
+    """The program of parameters and log densities of draws of one pixel; one for each number."""
     program = engine.program
 
     def of_pixel(data: Observations, z: Array) -> tuple[Values, Array]:
-        return evaluate_draws(program, z, data)
+        # Some together: more would be shared among cores that then wait for each other.
+        parameters, values = jax.lax.map(
+            lambda z: program.parameters_and_potential(z, data), z, batch_size=64
+        )
+        return parameters, jnp.where(jnp.isnan(values), -jnp.inf, -values)
 
     return batched(of_pixel, lanes=1)

@@ -72,11 +72,10 @@ class Laplace(AbstractMethod):
 
     @override
     def run_batch(self, batch: ProblemBatch) -> Iterator[BatchDraws]:
-        engine = batch.engine
-        if not engine.initializer.is_joint:
+        if not batch.engine.initializer.is_joint:
             yield from super().run_batch(batch)
             return
-        owner, modes = find_all_modes(engine, batch.pixels)
+        owner, modes = find_all_modes(batch)
         if not owner.size:
             return
         heaviest = np.unique(owner, return_index=True)[1]
@@ -85,7 +84,7 @@ class Laplace(AbstractMethod):
         yield BatchDraws(
             found.at,
             Status.GOOD,
-            engine.run(_normal_draws, count, found.pixels, *mode, found.keys),
+            found.run(_normal_draws, count, *mode, found.keys),
             np.full((len(found), count), 1.0 / count),
             float(count),
             MethodUsed.LAPLACE,

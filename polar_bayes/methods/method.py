@@ -7,7 +7,7 @@ import inspect
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, ClassVar, NamedTuple, NoReturn, Self, override
+from typing import Any, ClassVar, NoReturn, Self, override
 
 import jax
 import jax.numpy as jnp
@@ -167,7 +167,6 @@ class AbstractBatchMethod(HTMLRepr, abc.ABC):
         `size` is the number of its pixels, `sample` gives some of them drawn at random, and
         `is_shared` says whether pixels share parameters.
         """
-        del size, sample, is_shared
         return self, {}
 
     def check_least(self, **least: int) -> None:
@@ -237,7 +236,6 @@ class AbstractMethod(AbstractBatchMethod):
 
     def deadline(self, problem: Problem) -> float:
         """When comparisons are abandoned, on the clock of `time.perf_counter`, unit second."""
-        del problem
         return np.inf
 
     def for_comparison(
@@ -247,7 +245,6 @@ class AbstractMethod(AbstractBatchMethod):
 
         The first that trusts its draws is taken, and else the last.
         """
-        del problem, draws
         return (self,)
 
     def cross_check(self, problem: Problem, parameters: Values, key: Array) -> Provenance:
@@ -263,7 +260,6 @@ class AbstractMethod(AbstractBatchMethod):
         Returns:
             Entries of the provenance, which JSON can hold; none by default.
         """
-        del problem, parameters, key
         return {}
 
     @override
@@ -289,33 +285,24 @@ class AbstractMethod(AbstractBatchMethod):
                 parameters = problem.constrain(draws.z)
             if not finite_draws(parameters).any():
                 return None
-            judged = assess_draws(draws, parameters)
-            thinned = thin_draws(parameters, judged.ess)
+            status, effective, method = assess_draws(draws, parameters)
+            thinned = thin_draws(parameters, effective)
             count = len(next(iter(thinned.values())))
             return BatchDraws(
                 batch.at[[row]],
-                judged.status,
+                status,
                 {name: x[None] for name, x in thinned.items()},
                 np.full((1, count), 1.0 / count),
-                judged.ess,
-                judged.method,
-                judged.pareto_k,
+                effective,
+                method,
+                draws.pareto_k,
             )
 
         yield from (found for found in _THREADS.map(run, range(len(batch))) if found is not None)
 
 
-class Assessment(NamedTuple):
-    """Of one fit, as `Outcome` has it of many."""
-
-    ess: float
-    pareto_k: float
-    method: MethodUsed
-    status: Status
-
-
-def assess_draws(draws: PosteriorDraws, parameters: Values) -> Assessment:
-    """Status and effective sample size of one fit."""
+def assess_draws(draws: PosteriorDraws, parameters: Values) -> tuple[Status, float, MethodUsed]:
+    """Status, effective sample size and method of one fit."""
     finite = finite_draws(parameters)
     good, effective = not draws.doubts and bool(finite.all()), float(finite.sum())
     method = MethodUsed.__members__.get(draws.method.upper(), MethodUsed.OTHER)
@@ -324,8 +311,7 @@ def assess_draws(draws: PosteriorDraws, parameters: Values) -> Assessment:
         mixed = min(bulk.min(), tail.min()) >= SMALLEST_ESS and r_hat.max() <= LARGEST_R_HAT
         good = good and bool(mixed and draws.metadata.get("goals_reached", True))
         effective = float(np.nan_to_num(bulk.min(), nan=1.0))
-    status = Status.GOOD if good else Status.NOT_TRUSTED
-    return Assessment(effective, draws.pareto_k, method, status)
+    return Status.GOOD if good else Status.NOT_TRUSTED, effective, method
 
 
 def thin_draws(parameters: Values, effective: float) -> dict[str, np.ndarray]:

@@ -36,8 +36,6 @@ from polar_bayes.progress import Progress
 
 LARGEST_R_HAT = 1.008
 """A little below the 1.01 at which a fit is refused."""
-MOST_HALVINGS = 3
-"""Chains with divergences are sampled again with half the step size at most this often."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -216,7 +214,7 @@ def sample(
             states, steps = advance_all(states, min(warmup - begun, settings.block))
             warmup_steps += steps.n_steps.sum(axis=1)
         states = _pooled(states)
-        for halvings in range(MOST_HALVINGS + 1):
+        for halvings in range(4):  # at most three times half the step, while chains diverge
             if halvings:
                 warmup_steps += _stacked(rounds).n_steps.sum(axis=1)  # they are paid for, too
                 states, rounds = [_with_half_the_step(state) for state in states], []

@@ -52,14 +52,6 @@ COMPONENTS = 64
 """Of the mixture, or a multiple: one program draws from those of most posteriors."""
 
 
-class Peaks(NamedTuple):
-    """Modes of one posterior or of several, and the normal distributions there."""
-
-    z: Float[np.ndarray, "peak size"]
-    value: Float[np.ndarray, " peak"]
-    covariance: Float[np.ndarray, "peak size size"]
-
-
 class Components(NamedTuple):
     """Normal distributions, and the number of the peak that each belongs to."""
 
@@ -67,6 +59,14 @@ class Components(NamedTuple):
     z: Float[np.ndarray, "component size"]
     covariance: Float[np.ndarray, "component size size"]
     log_evidence: Float[np.ndarray, " component"]
+
+    @classmethod
+    def at(
+        cls, peak: np.ndarray, z: np.ndarray, value: np.ndarray, covariance: np.ndarray
+    ) -> "Components":
+        """Those at points where the potential has these values."""
+        evidence = -value + 0.5 * np.linalg.slogdet(covariance)[1]
+        return cls(peak, z, covariance, evidence)
 
 
 Conditional = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -77,23 +77,21 @@ ConditionalModes = Callable[[np.ndarray, np.ndarray, np.ndarray], Conditional]
 
 
 def profile_components(
-    peaks: Peaks, axes: np.ndarray, prior_sd: np.ndarray, conditional: ConditionalModes
+    peaks: Components, axes: np.ndarray, prior_sd: np.ndarray, conditional: ConditionalModes
 ) -> Components:
     """Normal distributions at every peak, and along its profiles.
 
     Args:
-        peaks: The peaks.
+        peaks: Those at the modes, each a peak of its own.
         axes: The coordinates that are moved.
         prior_sd: Standard deviations of all coordinates before any reading.
         conditional: Finds the modes of the others.
     """
-    size = peaks.z.shape[1]
-    every = np.arange(len(peaks.z))
-    found = [_components(every, *peaks)]
+    size, found = peaks.z.shape[1], [peaks]
     sd = np.sqrt(np.diagonal(peaks.covariance, axis1=1, axis2=2))
-    marginal = found[0].log_evidence[:, None] - np.log(sd)
+    marginal = peaks.log_evidence[:, None] - np.log(sd)
     factor = np.linalg.cholesky(peaks.covariance)
-    corners = np.meshgrid(every, axes if size <= MOST_COORDINATES else [], [-1.0, 1.0])
+    corners = np.meshgrid(peaks.peak, axes if size <= MOST_COORDINATES else [], [-1.0, 1.0])
     peak, axis, sign = (corner.ravel() for corner in corners)
     axis = axis.astype(int)
     z, own, step = peaks.z[peak], peaks.covariance[peak], sign * FIRST_STEP * sd[peak, axis]
@@ -111,7 +109,7 @@ def profile_components(
         unit = np.where(is_definite[:, None, None], np.diag(prior_sd), factor[peak])
         values, vectors = np.linalg.eigh(np.swapaxes(unit, 1, 2) @ hessian @ unit)
         root = unit @ vectors / np.sqrt(np.maximum(values, WIDEST**-2))[:, None]
-        reached = _components(peak, z, value, root @ np.swapaxes(root, 1, 2))
+        reached = Components.at(peak, z, value, root @ np.swapaxes(root, 1, 2))
         # Of the coordinate that was moved, by a normal distribution of the others.
         variance = reached.covariance[np.arange(axis.size), axis, axis]
         drop = marginal[peak, axis] - (reached.log_evidence - 0.5 * np.log(variance))
@@ -120,13 +118,6 @@ def profile_components(
         peak, z, own, _ = reached
         found.append(reached)
     return Components(*map(np.concatenate, zip(*found, strict=True)))
-
-
-def _components(
-    peak: np.ndarray, z: np.ndarray, value: np.ndarray, covariance: np.ndarray
-) -> Components:
-    evidence = -value + 0.5 * np.linalg.slogdet(covariance)[1]
-    return Components(peak, z, covariance, evidence)
 
 
 def mixture_of(components: Components, dtype: DTypeLike) -> Mixture:
@@ -154,7 +145,8 @@ def profile_mixture(coordinates: Coordinates) -> Mixture:
     potential = finite_potential(coordinates.potential)
     heavy = modes.weight >= LEAST_WEIGHT
     z, covariance = modes.z[heavy], modes.covariance[heavy]
-    peaks = Peaks(z, np.array([potential(each)[0] for each in z]), covariance)
+    value = np.array([potential(each)[0] for each in z])
+    peaks = Components.at(np.arange(len(z)), z, value, covariance)
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
 
     @functools.cache

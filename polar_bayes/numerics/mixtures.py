@@ -137,12 +137,6 @@ EM_STEPS = 15
 WIDE_SHARE, WIDE_SCALE = 0.15, 2.0
 """Of one more component around all draws: it reaches tails that the draws represent too little."""
 
-PRIOR_SCALE = 0.5
-"""Scale of a component without draws, in units of that of all draws."""
-
-PIXELS = 16
-"""Pixels whose mixture densities are computed together: their draws fit into a core's cache."""
-
 
 class Mixture(NamedTuple):
     """A mixture in coordinates in which all draws together have mean 0 and covariance 1."""
@@ -183,7 +177,8 @@ def fit_mixture(
     x = (z - center) @ _inverse(half).T
     counts = weights / jnp.sum(weights**2)  # their sum is the effective sample size
     begin = jax.random.choice(key, len(x), (components,), replace=False, p=weights)
-    unit = PRIOR_SCALE * jnp.eye(size, dtype=z.dtype)
+    # Of a component without draws, half as wide as all draws.
+    unit = 0.5 * jnp.eye(size, dtype=z.dtype)
     products = (x[:, :, None] * x[:, None, :]).reshape(len(x), -1)
 
     def improve(_: int, parts: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:

@@ -26,10 +26,6 @@ FINITE_VARIANCE = 0.5
 in 3 of 3 seeds."""
 
 
-TAIL = 0.05
-"""Share of the posterior at either end whose Monte Carlo error counts as that of the tails."""
-
-
 class Smoothed(NamedTuple):
     """Weights of the draws of every pixel."""
 
@@ -202,14 +198,12 @@ class Marginals:
         scores: Sequence[Callable[[Mapping[str, AnyArray]], np.ndarray]] = (),
     ) -> None:
         self._random, self._scores = random, scores
-        self.mean = {name: np.full((count, *own), np.nan) for name, own in sizes.items()}
-        self.sd = {name: np.full((count, *own), np.nan) for name, own in sizes.items()}
-        self.quantiles = {
-            name: np.full((len(LEVELS), count, *own), np.nan) for name, own in sizes.items()
-        }
-        self.slopes = {
-            name: np.full((len(scores), count, *own), np.nan) for name, own in sizes.items()
-        }
+
+        def empty(*first: int) -> dict[str, np.ndarray]:
+            return {name: np.full((*first, count, *own), np.nan) for name, own in sizes.items()}
+
+        self.mean, self.sd = empty(), empty()
+        self.quantiles, self.slopes = empty(len(LEVELS)), empty(len(scores))
 
     def describe(
         self, at: np.ndarray, parameters: Mapping[str, AnyArray], weights: np.ndarray

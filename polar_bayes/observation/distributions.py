@@ -7,7 +7,7 @@ written as a divergence plus Stirling remainders, so that concentrations of 1e8 
 
 import functools
 import math
-from typing import NamedTuple, override
+from typing import override
 
 import jax
 import jax.numpy as jnp
@@ -18,14 +18,6 @@ from jaxtyping import Array, Float
 from numpyro import distributions as dist
 from numpyro.distributions import constraints
 from numpyro.distributions.util import promote_shapes
-
-HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
-
-SMALLEST_SHAPE = 1e-6
-"""Least parameter of a Beta distribution whose margin is integrated: its derivative is finite."""
-
-MARGIN_NODES = 8
-"""Of the probability within the margin of a Beta distribution."""
 
 TAIL_NODES, TAIL_POWERS = 24, 20
 """Of the tail of Student's t: enough for the last digit of double precision."""
@@ -98,8 +90,8 @@ class MeanConcentrationBeta(dist.Distribution):
         mean, other = self.mean_value, 1.0 - self.mean_value
         near = jnp.where(is_high, other, mean) * self.concentration
         far = jnp.where(is_high, mean, other) * self.concentration
-        nodes, weights = (jnp.asarray(x, near.dtype) for x in _laguerre(MARGIN_NODES))
-        rate = jnp.maximum(near, SMALLEST_SHAPE)[..., None]
+        nodes, weights = (jnp.asarray(x, near.dtype) for x in _laguerre(8))
+        rate = jnp.maximum(near, 1e-6)[..., None]  # at zero the derivative is not finite
         inside = jnp.log1p(-self.margin * jnp.exp(-nodes / rate))
         exponent = (far[..., None] - 1.0) * (inside - math.log1p(-self.margin))
         return math.log(self.margin) - jnp.log(near) + logsumexp(exponent, axis=-1, b=weights)
@@ -115,7 +107,7 @@ class MeanConcentrationBeta(dist.Distribution):
         factor, rest = _stirling_remainder(jnp.stack([concentration, *shapes]))
         # One logarithm for four: in double precision they are what this density costs.
         factors = jnp.sqrt(concentration * shares[0] * shares[1]) * factor[0]
-        constant = jnp.log(factors / (factor[1] * factor[2])) - HALF_LOG_TWO_PI
+        constant = jnp.log(factors / (factor[1] * factor[2])) - 0.5 * math.log(2.0 * math.pi)
         constant += rest[0] - rest[1] - rest[2]
         excess = concentration * (divergence[0] + divergence[1])
         return constant - excess - jnp.log(value) - jnp.log1p(-value)
@@ -269,15 +261,8 @@ def _excess(
     return jnp.where(near, series, step - mean * jnp.log(quotient))
 
 
-class _Remainder(NamedTuple):
-    """`log(factor) + rest`."""
-
-    factor: Array
-    rest: Array
-
-
-def _stirling_remainder(z: Float[Array, "..."]) -> _Remainder:
-    """`log gamma(z)` less Stirling's `(z - 1/2) log z - z + log(2 pi) / 2`, for z > 0."""
+def _stirling_remainder(z: Float[Array, "..."]) -> tuple[Array, Array]:
+    """`log(factor) + rest`: Stirling's `(z - 1/2) log z - z + log(2 pi) / 2`, for z > 0."""
     # Below 10 the recurrence of the gamma function moves the argument up by eight, so that only
     # logarithms are differentiated: polygamma functions take long to compile.
     large = z > 10.0
@@ -289,7 +274,7 @@ def _stirling_remainder(z: Float[Array, "..."]) -> _Remainder:
     moved = (small + 0.5) * jnp.log(shifted / small) - 8.0
     rest = _stirling_series(jnp.where(large, z, shifted))
     factor = jnp.where(large, 1.0, shifted**7 / product)
-    return _Remainder(factor, jnp.where(large, rest, moved + rest))
+    return factor, jnp.where(large, rest, moved + rest)
 
 
 def _stirling_series(z: Float[Array, "..."]) -> Float[Array, "..."]:

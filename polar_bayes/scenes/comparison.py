@@ -77,9 +77,6 @@ LEAST_WEIGHT = 0.05
 BOOTSTRAPS, EM_STEPS = 400, 300
 """Of stacking weights: replicates of the Bayesian bootstrap, and steps of each optimization."""
 
-RESIDUAL_CHECKS = ("priors", "noise", "angle", "wavelength", "leave-one-out")
-"""Checks of `criticize` by which a scene has left something unexplained."""
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Fit:
@@ -100,7 +97,8 @@ class _Fit:
     @property
     def unexplained(self) -> bool:
         """Whether criticism says that the readings hold more than the scene."""
-        return any(name in self.findings.index for name in RESIDUAL_CHECKS)
+        checks = {"priors", "noise", "angle", "wavelength", "leave-one-out"}
+        return not checks.isdisjoint(self.findings.index)
 
     @property
     def is_contradicted(self) -> bool:
@@ -254,17 +252,9 @@ class FitArguments:
         """The request for one scene; a prior for a parameter that only others read is not used."""
         others = self.scene_parameters - set(scene.parameters)
         own = {name: prior for name, prior in (self.priors or {}).items() if name not in others}
-        return resolve(
-            self.capture,
-            self.model,
-            scene,
-            own or None,
-            self.chosen_links,
-            self.largest_view_zenith,
-            self.seed,
-            self.precision,
-            known=self.known,
-        )
+        asked = self.capture, self.model, scene, own or None, self.chosen_links
+        limits = self.largest_view_zenith, self.seed, self.precision
+        return resolve(*asked, *limits, known=self.known)
 
 
 class _Fits:

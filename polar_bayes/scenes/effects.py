@@ -142,7 +142,7 @@ class EffectSelection:
         """Effects by the key path of their part, the replacement of fewest operations first."""
 
         def operations(effect: Effect) -> float:
-            return self.densities.density(effect.apply(self.full)).compiled.operations
+            return self.densities.density(effect.apply(self.full)).operations
 
         groups: dict[KeyPath, list[Effect]] = {}
         for effect in sorted(effects, key=operations):
@@ -426,7 +426,7 @@ def choose_effects(
     with jax.enable_x64(True):
         densities = SceneDensities(request, priors, progress or no_progress)
         # Unknown priors are refused before minutes are spent.
-        resolve_priors(densities.priors(full).read, priors)
+        resolve_priors(densities.names_read(full), priors)
         selection = EffectSelection(densities, full, effects, names, float(tolerance))
         selection.select(kept, dropped)
         ledger = make_ledger(selection, [*kept, *dropped], settings)

@@ -59,18 +59,19 @@ def fit_request(
     _check_room(problem, PRIOR_DRAWS)
     method.prepare(problem)
     problem.prepare_predictions()
-    timings, prepared = _Timings(start_time), time.perf_counter() - start_time
+    prepared = time.perf_counter()
     draws = method.run(problem, key_draws, progress)
-    timings.record("draws")
+    ended = {"": start_time}  # when each stage had ended, compilation included
     if problem.search_seconds:
-        timings.split("draws", "modes", prepared + problem.search_seconds)
+        ended["modes"] = prepared + problem.search_seconds
+    ended["draws"] = time.perf_counter()
     _check_room(problem, draws.z[..., 0].size + PRIOR_DRAWS)
     posterior = problem.predict(key_posterior, draws.z)
     prior_z = from_prior(problem.program, key_prior, PRIOR_DRAWS, problem.data)
     prior = problem.predict(key_prior, prior_z[None])
-    timings.record("prediction")
+    ended["prediction"] = time.perf_counter()
     checked = method.cross_check(problem, posterior.parameters, key_check)
-    timings.record("cross-check")
+    ended["cross-check"] = time.perf_counter()
     is_point = draws.covariance is not None
 
     stated = {name: getattr(draws, name) for name in DIAGNOSTICS}
@@ -87,21 +88,14 @@ def fit_request(
     def result(
         comparisons: Mapping[str, xr.Dataset], failed: dict[str, str], alternatives: Provenance
     ) -> xr.DataTree:
-        seconds = {stage: round(each, 3) for stage, each in timings.seconds.items()}
+        spent = np.diff(list(ended.values())).round(3).tolist()
+        seconds = dict(zip(list(ended)[1:], spent, strict=True))
         provenance = {**known, "timings": seconds, **alternatives}
         provenance |= {"comparisons_failed": failed} if failed else {}
         ledger = request.scene.ledger  # how the scene was chosen
         tables = {"effects": ledger} if isinstance(ledger, xr.Dataset) else {}
-        return assemble(
-            problem.program,
-            request.capture,
-            problem.data,
-            posterior,
-            prior,
-            draws.stats,
-            {**comparisons, **tables},
-            provenance,
-        )
+        given = problem.program, request.capture, problem.data, posterior, prior, draws.stats
+        return assemble(*given, {**comparisons, **tables}, provenance)
 
     if not with_comparisons or is_point:  # a point has no interval to compare
         return result({}, {}, {})
@@ -112,13 +106,13 @@ def fit_request(
     methods = method.for_comparison(problem, draws)
     given = request, problem, methods, deadline, key_comparisons, progress
     comparisons, failed = fit_comparisons(removed, *given)
-    timings.record("comparisons")
+    ended["comparisons"] = time.perf_counter()
     if STOPPED in failed.values():
         return result(comparisons, failed, {"alternatives_failed": STOPPED})
     alternatives = try_alternatives(
         request, problem, posterior.parameters, key_check, progress, deadline=deadline
     )
-    timings.record("alternatives")
+    ended["alternatives"] = time.perf_counter()
     return result(comparisons, failed, alternatives)
 
 
@@ -143,24 +137,6 @@ def choose_method(
     if given:
         return methods.Auto(**given)
     return find_method(method, "fit", one=True)
-
-
-class _Timings:
-    """Seconds of each stage, compilation included."""
-
-    def __init__(self, start_time: float) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = start_time
-
-    def record(self, stage: str) -> None:
-        now = time.perf_counter()
-        self.seconds[stage] = now - self._last
-        self._last = now
-
-    def split(self, stage: str, first: str, seconds: float) -> None:
-        """Count so many seconds of a stage as those of its first part."""
-        self.seconds[first] = seconds
-        self.seconds[stage] -= seconds
 
 
 def _check_room(problem: Problem, draws: int) -> None:

@@ -16,6 +16,7 @@ Assoc. 90, 773 (Bayes factors).
 
 import contextlib
 import dataclasses
+import functools
 import itertools
 import math
 from collections.abc import Collection, Mapping
@@ -164,10 +165,7 @@ def try_alternatives(
     compared: Collection[Scene] = (),
 ) -> Provenance:
     """Entries of the provenance: the comparison with alternative parts, or why there is none."""
-
-    def compare(progress: Progress) -> list[Provenance]:
-        return compare_alternatives(request, problem, posterior, key, progress, compared)
-
+    compare = functools.partial(compare_alternatives, request, problem, posterior, key, compared)
     try:
         return {"alternatives": run_until(deadline, progress, compare)}
     except (FitError, OutOfTimeError) as error:
@@ -194,8 +192,8 @@ def compare_alternatives(
     problem: Problem,
     posterior: Values,
     key: Array,
+    compared: Collection[Scene],
     progress: Progress,
-    compared: Collection[Scene] = (),
 ) -> list[Provenance]:
     """For each alternative its log Bayes factor and the answer that it gives, as JSON holds it.
 
@@ -222,7 +220,8 @@ def compare_alternatives(
             where="alternatives",
             hint="fit one patch alone",
         )
-    evidence, values = _log_evidence(found.potential, found.modes), _at_mode(problem, found.modes)
+    evidence, heaviest = _log_evidence(found.potential, found.modes), found.modes.z[None, :1]
+    values = {name: np.asarray(x)[0, 0] for name, x in problem.constrain(heaviest).items()}
     names = values.keys() & posterior.keys()
     sd = {name: np.std(np.asarray(posterior[name]), axis=(0, 1)) for name in names}
     rows = []
@@ -305,9 +304,3 @@ def _log_evidence(potential: ValueAndGradient, modes: Modes) -> float:
     """Laplace's approximation of the log evidence, summed over the modes."""
     volume = 0.5 * np.linalg.slogdet(2.0 * math.pi * modes.covariance[0])[1]
     return float(volume - potential(modes.z[0])[0] - math.log(modes.weight[0]))
-
-
-def _at_mode(problem: Problem, modes: Modes) -> dict[str, np.ndarray]:
-    """Parameters at the mode of largest weight."""
-    found = problem.constrain(modes.z[None, :1])
-    return {name: np.asarray(value)[0, 0] for name, value in found.items()}

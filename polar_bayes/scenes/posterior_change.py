@@ -44,23 +44,14 @@ from polar_bayes.progress import Progress
 # --- Cost of a compiled program -------------------------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True)
-class Compiled:
-    """A compiled program, its operations, and the time of its compilation."""
-
-    call: Callable
-    operations: float
-    compile_seconds: float
-
-
-def compile_and_count(function: Callable, *arguments: object) -> Compiled:
-    """Compile a function for arguments of these shapes."""
+def compile_and_count(function: Callable, *arguments: object) -> tuple[Callable, float, float]:
+    """A function compiled for arguments of these shapes, its operations, and the time it took."""
     begin = time.perf_counter()
     program = jax.jit(function).lower(*arguments).compile()
     seconds = time.perf_counter() - begin
     counts = program.cost_analysis() or {}
     operations = sum(counts.get(kind, math.nan) for kind in ("flops", "transcendentals"))
-    return Compiled(program, float(operations), seconds)
+    return program, float(operations), seconds
 
 
 def run_seconds(
@@ -93,13 +84,15 @@ class SceneDensity:
 
     program: Program
     data: Observations
-    compiled: Compiled
+    call: Callable
+    operations: float
+    compile_seconds: float
     labels: tuple[str, ...]
     sites: tuple[str, ...]
 
     def evaluate(self, z: np.ndarray) -> tuple[Array, dict[str, Array]]:
         """The potential and the noise-free readings at an unconstrained vector."""
-        return self.compiled.call(np.asarray(z), self.data)
+        return self.call(np.asarray(z), self.data)
 
     def potential(self, z: np.ndarray) -> float:
         """Minus the log density of an unconstrained vector (size,), up to a constant."""
@@ -143,17 +136,17 @@ def compile_density(request: Request, data: Observations) -> SceneDensity:
     """Compile the log density of a request's scene."""
     # No gradient, no method and no second capture needs this program, so it is not among those that
     # fits of one layout share.
-    program = compile_program(request.bind(request.scene), data)
+    program = compile_program(request.bind(), data)
 
     def evaluate(z: Array, data: Observations) -> tuple[Array, dict[str, Array]]:
         terms, trace = program.log_terms(z, data)
         predicted = {name: noise_free(trace, name) for name in program.observed}
         return -sum(terms.values(), jnp.zeros((), z.dtype)), predicted
 
-    compiled = compile_and_count(evaluate, np.zeros(program.size), data)
+    counted = compile_and_count(evaluate, np.zeros(program.size), data)
     coordinates = label_coordinates(program, request.capture)
     labels, sites = (tuple(getattr(c, name) for c in coordinates) for name in ("label", "site"))
-    return SceneDensity(program, data, compiled, labels, sites)
+    return SceneDensity(program, data, *counted, labels, sites)
 
 
 # --- Laplace approximations of two scenes ---------------------------------------------------------
@@ -314,7 +307,7 @@ class SceneDensities:
     """Densities of scenes for one capture, each compiled once."""
 
     def __init__(
-        self, request: Request, priors: Mapping[str, dist.Distribution] | None, progress: Progress
+        self, request: Request, priors: Mapping[str, dist.Distribution], progress: Progress
     ) -> None:
         self.progress = progress
         self._request, self._priors = request, priors
@@ -324,17 +317,16 @@ class SceneDensities:
     def density(self, scene: Scene) -> SceneDensity:
         """The density of a scene; a prior for a parameter that it lacks is not used."""
         if scene not in self._densities:
-            table = self.priors(scene)
-            priors = {name: table.row(name) for name in table.read}
+            table = PriorTable(self._priors)
+            priors = {name: table.row(name) for name in self.names_read(scene)}
             request = dataclasses.replace(self._request, scene=scene, priors=priors)
             self._densities[scene] = compile_density(request, self._data)
         return self._densities[scene]
 
-    def priors(self, scene: Scene) -> PriorTable:
-        """The priors, which note the names that the model reads with that scene."""
-        table = PriorTable(self._priors)
-        inspect_model(self._request.model, self._data, scene, table, self._request.links)
-        return table
+    def names_read(self, scene: Scene) -> tuple[str, ...]:
+        """Names of the priors that the model reads with a scene."""
+        request = dataclasses.replace(self._request, scene=scene, priors=self._priors)
+        return inspect_model(request, self._data).priors
 
     def baseline(self, scene: Scene, parameters: tuple[str, ...] | None) -> Baseline:
         """A scene to compare with."""
@@ -351,8 +343,8 @@ class SceneDensities:
         timed = zip(self._densities.items(), run_seconds(calls), strict=True)
         return {
             scene: {
-                "operations": density.compiled.operations,
-                "compile_seconds": density.compiled.compile_seconds,
+                "operations": density.operations,
+                "compile_seconds": density.compile_seconds,
                 "run_seconds": seconds,
             }
             for (scene, density), seconds in timed

@@ -36,12 +36,6 @@ OF_DRAWS = (
 SHARED = ("prior", "prior_predictive", "observed_data", "constant_data")
 """Groups that are taken from the scene of largest weight."""
 
-NOT_STACKED = ("log_weight", "lp")
-"""Statistics whose constants differ between scenes."""
-
-BY_PARAMETER = ("priors", "bounds", "prior_probability", "fixed", "declared")
-"""Entries of the provenance that are mappings by parameter."""
-
 
 def fit_best_scenes(
     arguments: FitArguments,
@@ -120,7 +114,8 @@ def stack_fits(fits: Mapping[str, xr.DataTree], weights: Mapping[str, float]) ->
     groups: dict[str, xr.Dataset] = {}
     for group in (name for name in OF_DRAWS if all(name in t.children for t in trees.values())):
         datasets = [tree[group].to_dataset() for tree in trees.values()]
-        names = [name for name in _shared(datasets) if name not in NOT_STACKED]
+        # Statistics whose constants differ between scenes are not stacked.
+        names = [name for name in _shared(datasets) if name not in ("log_weight", "lp")]
         if not names:
             continue
         parts = [
@@ -178,7 +173,7 @@ def _provenance(
     found = dict(next(iter(each.values())))
     for key in ("modes", "pareto_k"):
         found.pop(key, None)
-    for key in BY_PARAMETER:
+    for key in ("priors", "bounds", "prior_probability", "fixed", "declared"):
         found[key] = {n: x for n, x in (found.get(key) or {}).items() if n in shared}
     found["scene_parts"] = "; ".join(
         f"{weights[name]:.2f} x {own.get('scene_parts', '')}" for name, own in each.items()

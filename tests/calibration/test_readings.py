@@ -20,6 +20,7 @@ from polar_bayes.calibration.predictive import (
 )
 from polar_bayes.calibration.runner import draw_captures
 from polar_bayes.inference.compiled_model import CompiledModel
+from polar_bayes.inference.problem_batch import problem_batch
 from polar_bayes.inference.program import compile_program
 from polar_bayes.observation.data import observe
 
@@ -41,10 +42,11 @@ def read():
     valid = xr.DataArray([True, True, False, True, True], dims="view")
     data = observe(capture.assign(valid=valid))
     program, numbers = compile_program(shifted, data), np.arange(FITS)
-    engine = CompiledModel(lambda: shifted, shifted, program, data, "double")
+    engine = CompiledModel(lambda: shifted, program, data, "double")
     drawn = draw_captures(program, data, numbers, jax.random.key(3), replicate=True)
     again = drawn.replicated
-    readings = PredictivePit(engine, drawn.captures, again, numbers, seed=4)
+    batch = problem_batch(engine, drawn.captures, numbers, seed=4)
+    readings = PredictivePit(batch, again, numbers)
     q = np.asarray(drawn.captures.batched.readings["q"])[:, valid.to_numpy()]
     variance = 1.0 / (1.0 / 0.3**2 + q.shape[1] / NOISE**2)
     mean = variance * q.sum(axis=1) / NOISE**2

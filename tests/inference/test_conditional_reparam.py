@@ -47,7 +47,7 @@ def capture() -> xr.Dataset:
 def found(capture: xr.Dataset, model) -> tuple[ConditionalReparam | None, Observations]:
     request = resolve(capture, model, SCENE, None, LINKS, None, 0, "double")
     data = observe(request.capture)
-    return find_coefficients(compile_program(request.bind(SCENE), data), data), data
+    return find_coefficients(compile_program(request.bind(), data), data), data
 
 
 @pytest.fixture(scope="module")

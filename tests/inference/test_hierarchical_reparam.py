@@ -49,7 +49,7 @@ def capture() -> xr.Dataset:
 def made(capture: xr.Dataset):
     request = resolve(capture, normal_normal, SCENE, None, LINKS, None, 0, "double")
     data = observe(request.capture)
-    program = compile_program(request.bind(SCENE), data)
+    program = compile_program(request.bind(), data)
     groups = find_groups(program, data)
     return HierarchicalReparam(program, groups), data
 
@@ -73,7 +73,7 @@ def at_point(data, rng: np.random.Generator, exact: np.ndarray | None = None) ->
             np.zeros(2), np.eye(2), exact.mean(axis=1, keepdims=True), nothing, curvature,
             np.zeros((MEMBERS, 1, 2)),
         )  # fmt: skip
-    return ReparamInputs(*map(jnp.asarray, parts), data)
+    return ReparamInputs(data, *map(jnp.asarray, parts))
 
 
 @pytest.mark.thorough

@@ -8,8 +8,9 @@ from cases import each
 from numpyro import handlers
 
 import polar_bayes as pb
+from polar_bayes.inference.model_parts import ModelParts
 from polar_bayes.inference.problem import Problem, compile_model, observe_request
-from polar_bayes.inference.request import is_padded, resolve
+from polar_bayes.inference.request import resolve
 from polar_bayes.models.per_material import per_material
 from polar_bayes.observation.data import padded_length
 from polar_bayes.physics.scene import SCENES
@@ -66,5 +67,5 @@ def own_model(data, scene, priors, links):
     [(per_material, True), (handlers.scale(per_material, 0.5), True), (own_model, False)],
 )
 def test_what_need_not_mask_is_not_padded(model, padded: bool) -> None:
-    scene = SETUPS["paper"]
-    assert is_padded(model, SCENES["paper"], scene.links) == padded
+    parts = ModelParts(model, SCENES["paper"], {}, SETUPS["paper"].links)
+    assert parts.is_padded == padded

@@ -27,7 +27,7 @@ from spectral_plates import spectral_plate
 import polar_bayes as pb
 from polar_bayes.inference import program as programs
 from polar_bayes.inference import request
-from polar_bayes.inference.cache_key import cache_key
+from polar_bayes.inference.model_parts import ModelParts
 from polar_bayes.inference.problem import compile_model
 from polar_bayes.inference.program import ModelInfo, inspect_model
 from polar_bayes.inference.request import resolve
@@ -206,9 +206,9 @@ def test_the_same_question_shares_what_is_compiled(what: str) -> None:
 def test_a_story_is_told_to_the_first_capture_of_a_layout_only(monkeypatch):
     told: list[tuple[int, ...]] = []
 
-    def with_progress(model, data, *others) -> ModelInfo:
+    def with_progress(parts, data) -> ModelInfo:
         told.append(data.shape)
-        return inspect_model(model, data, *others)
+        return inspect_model(parts, data)
 
     monkeypatch.setattr(request, "inspect_model", with_progress)
     asked = (shifted(0.25), PLATE, None, LINKS, None, 0, "double")
@@ -237,7 +237,7 @@ def test_how_a_scene_was_chosen_does_not_count() -> None:
     chosen = [ChosenScene(**parts) for _ in range(2)]
     for number, scene in enumerate(chosen):
         object.__setattr__(scene, "ledger", xr.Dataset({"cost": number}))
-    keys = [cache_key(per_material, scene, {}, LINKS) for scene in chosen]
+    keys = [ModelParts(per_material, scene, {}, LINKS).key() for scene in chosen]
     assert keys[0] == keys[1]
 
 
@@ -272,8 +272,8 @@ def load_anew(folder: Path, *edit: str) -> tuple[str, ...]:
     importlib.invalidate_caches()
     mine = importlib.import_module("model_of_mine")
     models = (mine.model, mine.Model(), handlers.condition(mine.model, data={}))
-    keys = [cache_key(model, PLATE, {}, {}) for model in models]
-    return *keys, cache_key(per_material, PLATE, {}, {"q": mine.Link()})
+    keys = [ModelParts(model, PLATE, {}, {}).key() for model in models]
+    return *keys, ModelParts(per_material, PLATE, {}, {"q": mine.Link()}).key()
 
 
 def test_a_model_that_is_edited_and_loaded_again_is_another(tmp_path, monkeypatch):
@@ -357,7 +357,7 @@ def test_what_is_edited_in_a_notebook_is_another_scene_to_simulate_and_to_fit() 
 
     def asked() -> tuple[str, float]:
         capture = pb.simulate("plastic", scene=scene, protocol=few)
-        return cache_key(model, scene, {}, LINKS), float(capture["dop"].sum())
+        return ModelParts(model, scene, {}, LINKS).key(), float(capture["dop"].sum())
 
     before = asked()
     assert asked() == before

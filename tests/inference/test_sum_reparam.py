@@ -60,7 +60,7 @@ def made(capture: xr.Dataset, precision: str = "double") -> tuple[ConditionalRep
     request = asked(capture, precision=precision)
     data = observe(request.capture)
     data = data if precision == "double" else data.in_single_precision()
-    program = compile_program(request.bind(SCENE), data)
+    program = compile_program(request.bind(), data)
     reparam = find_coefficients(program, data)
     assert reparam is not None
     assert reparam.sums is not None
@@ -132,7 +132,7 @@ def test_what_is_held_keeps_its_coordinates(capture) -> None:
 
 def test_bounded_shares_keep_their_coordinates(capture) -> None:
     request = asked(capture, bounded)
-    program = compile_program(request.bind(SCENE), observe(request.capture))
+    program = compile_program(request.bind(), observe(request.capture))
     assert set(program.summed) == {"leak", "body"}
     assert find_sum(program) is None
 

@@ -17,7 +17,7 @@ from textbook import plate_q
 import polar_bayes as pb
 from polar_bayes.inference.batching import Status
 from polar_bayes.maps.criticism import Criticism
-from polar_bayes.maps.residuals import Fitted, direction_kernels, residual_tail, standardize
+from polar_bayes.maps.residuals import direction_kernels, residual_tail, standardize
 from polar_bayes.observation.distributions import MeanConcentrationBeta, SensorStudentT
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.reporting.report import render
@@ -176,7 +176,7 @@ def linear(views, groups, size, missing=0.0, count=20_000):
     e += np.einsum("gvk,pk->pgv", design, rng.normal(size=(count, size)))
     e[rng.random(e.shape) < missing] = np.nan
     geometry = Geometry(views, np.full(views.size, 180.0), views, np.zeros(views.size))
-    return Fitted(e, np.broadcast_to(design, (count, *design.shape))), direction_kernels(geometry)
+    return e, np.broadcast_to(design, (count, *design.shape)), direction_kernels(geometry)
 
 
 @each(
@@ -184,18 +184,18 @@ def linear(views, groups, size, missing=0.0, count=20_000):
     [(6, 1, 2, 0.0), (6, 1, 4, 0.0), (18, 1, 2, 0.3), (12, 3, 5, 0.1)],
 )
 def test_residuals_of_noise_alone_are_a_problem_once_in_250(views, groups, size, missing):
-    fitted, kernels = linear(np.linspace(20.0, 80.0, views), groups, size, missing)
-    p_value = residual_tail(fitted, kernels, np.ones(len(fitted.scores)))
+    scores, changes, kernels = linear(np.linspace(20.0, 80.0, views), groups, size, missing)
+    p_value = residual_tail(scores, changes, kernels, np.ones(len(scores)))
     p_value = p_value[np.isfinite(p_value)]
-    assert p_value.size > 0.9 * len(fitted.scores)
+    assert p_value.size > 0.9 * len(scores)
     for level in (0.02, 0.004):
         most = stats.binom.ppf(1.0 - MOST_FALSE, p_value.size, level)
         assert 0 < np.sum(p_value < level) <= most
 
 
 def test_fewer_than_six_readings_are_not_judged() -> None:
-    fitted, kernels = linear(np.linspace(20.0, 80.0, 5), 1, 2, count=10)
-    assert np.isnan(residual_tail(fitted, kernels, np.ones(10))).all()
+    pixels = linear(np.linspace(20.0, 80.0, 5), 1, 2, count=10)
+    assert np.isnan(residual_tail(*pixels, np.ones(10))).all()
 
 
 NOISES = {

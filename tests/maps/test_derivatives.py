@@ -87,7 +87,7 @@ def case(name: str) -> Case:
     capture, asked = build()
     request = resolve(capture, asked["model"], PLATE, PRIORS, asked["links"], None, 0, "double")
     data = observe(request.capture)
-    program = compile_program(request.bind(PLATE), data)
+    program = compile_program(request.bind(), data)
     assert program.size == size
     points = np.random.default_rng(5).normal(0.0, 0.7, (4, size))
     return Case(program, data, points)

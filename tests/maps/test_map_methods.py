@@ -75,8 +75,8 @@ def test_modes_given_one_coordinate_are_found_around_a_bend(image: xr.Dataset) -
     at = {name: int(index) for name, index in plan.engine.program.positions.items()}
     z, fixed = np.zeros((3, 3)), np.full(3, at["place"])
     z[:, at["place"]] = place = np.array([-2.0, 0.5, 3.0])
-    pixels = plan.pixels(one).subset(np.zeros(3, int))
-    found, value, _ = find_conditional_modes(plan.engine, pixels, z, fixed)
+    batch = plan.batch(one).subset(np.zeros(3, int))
+    found, value, _ = find_conditional_modes(batch, z, fixed)
     along = place / (1.0 + BEND**2)
     expected = {"along": along, "across": along**2, "place": place}
     for name, truth in expected.items():

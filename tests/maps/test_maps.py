@@ -16,7 +16,7 @@ from plate_images import ASKED, NAMES, mapped, planned, plate_image, stacked
 from scipy import optimize, stats
 
 import polar_bayes as pb
-from polar_bayes.inference.batch_modes import find_modes
+from polar_bayes.inference.batch_modes import find_modes_from, find_starts
 from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.inference.program import Program
 from polar_bayes.inference.result import PROVENANCE
@@ -94,13 +94,13 @@ GOAL = 1e-4
 """Posterior sds within which a search for modes ends."""
 
 
-def assert_modes_agree(plan, pixels, covariance=None):
+def assert_modes_agree(plan, batch, covariance=None):
     """Of all pixels that arrived; how many did."""
-    found = find_modes(plan.engine, pixels)
+    found = find_modes_from(batch, find_starts(batch)[:, 0])
     twin = Twin(plan.engine.program)
     for number in np.flatnonzero(found.converged):
         z, half = found.mode.z[number], found.mode.root[number]
-        data = pixels.pixel(number)
+        data = batch.pixels.pixel(number)
         # From a start two posterior widths away the climb back is SciPy's own.
         mode = twin.mode(z + np.full(z.size, 2.0 / z.size**0.5) @ half, data)
         own_covariance = covariance or twin.covariance

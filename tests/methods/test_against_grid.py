@@ -55,7 +55,7 @@ def grid_posterior(capture: xr.Dataset) -> Grid:
     """Evaluate the log density on a grid wide enough to hold all but 1e-8 of the mass."""
     request = resolve(capture, "per_material", PLATE, None, LINKS, None, 0, "double")
     data = observe(request.capture)
-    program = compile_program(request.bind(PLATE), data)
+    program = compile_program(request.bind(), data)
     draws = pb.fit(capture, scene=PLATE, links=LINKS, method="nuts", seed=5)
     posterior = draws["posterior"].dataset
     # Axes: the unconstrained coordinates in the program's order, around the sampled range,

@@ -206,7 +206,7 @@ def test_density_and_gradient_are_finite(colors: np.ndarray, precision: str) -> 
             lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x,
             observe(request.capture),
         )
-        program = compile_program(request.bind(PLATE), data)
+        program = compile_program(request.bind(), data)
         density = jax.jit(jax.value_and_grad(program.potential))
         for seed in range(3):
             z = np.asarray(program.from_prior(jax.random.key(seed), data))

@@ -64,7 +64,7 @@ def test_members_are_drawn_from_the_population(name: str) -> None:
     request = resolve(capture, model, "paper", near, LINKS, None, 0, "double")
     data = observe(request.capture)
     held = {f"{name}_location": np.float64(location)} if name == "refractive_index" else {}
-    told = handlers.substitute(request.bind(request.scene), data=held)
+    told = handlers.substitute(request.bind(), data=held)
     program = compile_program(told, data)
     keys = jax.random.split(jax.random.key(3), 5)
     draw = jax.jit(

@@ -147,7 +147,7 @@ def operations(predict, names) -> float:
         return sum(jnp.sum(weights[name] * values) for name, values in predicted.items())
 
     weights = {name: jnp.ones(16) for name in ("dop", "q", "u", "intensity")}
-    return compile_and_count(jax.value_and_grad(weighed), parameters, weights).operations
+    return compile_and_count(jax.value_and_grad(weighed), parameters, weights)[1]
 
 
 @pytest.fixture(scope="module")
@@ -186,9 +186,9 @@ def test_costs_are_counted_and_timed() -> None:
         compile_and_count(lambda x: jnp.sum(jnp.exp(x @ x)), jnp.ones((size, size)))
         for size in (4, 256)
     )
-    assert large.operations > 1000.0 * small.operations > 0.0
-    assert small.compile_seconds > 0.0
+    assert large[1] > 1000.0 * small[1] > 0.0
+    assert small[2] > 0.0
     quick, slow = run_seconds(
-        [lambda: small.call(jnp.ones((4, 4))), lambda: large.call(jnp.ones((256, 256)))]
+        [lambda: small[0](jnp.ones((4, 4))), lambda: large[0](jnp.ones((256, 256)))]
     )
     assert 0.0 < quick < slow

@@ -101,7 +101,7 @@ def test_labels_are_those_of_the_tables_of_a_fit() -> None:
     )
     request = request_of(capture, scene)
     data = observe(request.capture)
-    program = compile_program(request.bind(scene), data)
+    program = compile_program(request.bind(), data)
     coordinates = label_coordinates(program, request.capture)
     labels, sites = zip(*((each.label, each.site) for each in coordinates), strict=True)
     assert set(labels) == {
