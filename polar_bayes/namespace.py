@@ -4,9 +4,13 @@ import contextlib
 import os
 import random
 import sys
+import time
 from collections.abc import Callable, Iterator
 
 import lazy_loader
+
+IMPORTED = time.time()
+"""When the package was imported, before any of its modules."""
 
 Attached = tuple[Callable[[str], object], Callable[[], list[str]], list[str]]
 

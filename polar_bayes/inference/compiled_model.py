@@ -19,7 +19,8 @@ from polar_bayes.inference.model_parts import ModelParts, layout_of
 from polar_bayes.inference.program import Model, Program, compile_program, from_prior
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import dims_of, shape_of
-from polar_bayes.numerics.compile import TRACING_LOCK, LRUCache
+from polar_bayes.numerics.compile import TRACING_LOCK, JitOnce, LRUCache
+from polar_bayes.numerics.fingerprint import fingerprint
 from polar_bayes.observation.data import Observations
 
 MOMENTS = 4000
@@ -57,7 +58,8 @@ class CompiledModel:
         if self.precision == "single":
             return self.program
         with jax.enable_x64(False), TRACING_LOCK:
-            return compile_program(self.bind(), self.layout.in_single_precision())
+            single = compile_program(self.bind(), self.layout.in_single_precision())
+        return dataclasses.replace(single, key=self.program.key)
 
     @property
     def dtype(self) -> type[np.floating]:
@@ -66,7 +68,14 @@ class CompiledModel:
 
     def made[S: Hashable, P](self, make: Callable[["CompiledModel", S], P], settings: S) -> P:
         """What a method makes of the model for its settings, a program say, at its first use."""
-        return self._made.of((make, settings), lambda: make(self, settings))
+
+        def made() -> P:
+            found = make(self, settings)
+            if isinstance(found, JitOnce) and self.program.key:
+                found.key = f"{self.program.key} {fingerprint(make, settings, code=())}"
+            return found
+
+        return self._made.of((make, settings), made)
 
     @functools.cached_property
     def parameter_axes(self) -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
@@ -128,6 +137,7 @@ def compile_layout(
         data = data if is_double else data.in_single_precision()
         with jax.enable_x64(is_double):
             program = compile_program(parts.bind(), data)
+        program = dataclasses.replace(program, key="" if parts.has_own_code else key)
         return CompiledModel(parts.bind, program, data, request.precision, parts.priors)
 
     with TRACING_LOCK:

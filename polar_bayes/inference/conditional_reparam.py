@@ -88,8 +88,9 @@ class ConditionalReparam(AbstractDensity[ConditionalInputs]):
     @functools.cached_property
     def forward_of_block(self) -> JitOnce:
         """`forward` of many vectors, compiled."""
-        return JitOnce(
-            lambda x, given: jax.lax.map(lambda one: self.forward(one, given), x, batch_size=50)
+        return self.once(
+            "forward_of_block",
+            lambda x, given: jax.lax.map(lambda one: self.forward(one, given), x, batch_size=50),
         )
 
     def inputs(

@@ -11,7 +11,7 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple, override
+from typing import ClassVar, NamedTuple, override
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,7 @@ from polar_bayes.inference.hierarchical_reparam import (
 )
 from polar_bayes.inference.program import (
     BLOCK,
+    AbstractDensity,
     Program,
     begin_from_prior,
     first_key,
@@ -62,15 +63,12 @@ HEAVY_MODE = 0.01
 Draws = tuple[np.ndarray, dict[str, np.ndarray]]
 """Unconstrained draws (chain, draw, size), and statistics, each (chain, draw)."""
 
-type Density = Callable[[Array, Any], Array]
-"""Minus the log density of chains, from coordinates and what is given."""
-
 
 class Target(NamedTuple):
     """A density for chains, with starting points and metric."""
 
-    density: Density
-    """Minus its log, from coordinates and `given`; one object for all captures of a layout."""
+    density: AbstractDensity
+    """Of coordinates and `given`; one object for all captures of a layout."""
     given: object
     potential: ValueAndGradient
     starts: np.ndarray
@@ -86,8 +84,7 @@ class Coordinates:
     """Coordinates of the posterior of one material: the program's, or standardized ones.
 
     Args:
-        density: Minus the log density, from coordinates and `given`; one object for all captures
-            of a layout.
+        density: Of coordinates and `given`; one object for all captures of a layout.
         given: The capture, and what the coordinates depend on.
         potential: `density` of this capture, with its gradient.
         log_density_of: Log densities of vectors of the program, (draw, size).
@@ -98,7 +95,7 @@ class Coordinates:
             vectors, compiled; None where they are the same.
     """
 
-    density: Density
+    density: AbstractDensity
     given: object
     potential: ValueAndGradient
     log_density_of: Callable[[np.ndarray], np.ndarray]
@@ -194,7 +191,7 @@ class JointInit(AbstractInit):
         reparam, program = self.initializer.reparam, self.initializer.program
         prior = from_prior(program, first_key(), BLOCK, self.data)
         own = Coordinates(
-            program.potential_jit,
+            program,
             self.data,
             self.potential,
             lambda z: program.log_density(z, self.data),
@@ -215,7 +212,7 @@ class JointInit(AbstractInit):
         prior_sd = finite_sd(reparam.backward(prior, self.data))
         prior_sd[reparam.coefficients] = 1.0
         return Coordinates(
-            reparam.potential_jit,
+            reparam,
             given,
             potential,
             own.log_density_of,
@@ -274,7 +271,7 @@ class HierarchicalInit(AbstractInit):
         # common parameters can have any shape with few groups; with many it is about normal.
         few = size <= 60
         return Target(
-            density=self.reparam.potential_jit,
+            density=self.reparam,
             given=self.given,
             potential=self.potential,
             starts=self._draw_starts(key, chains),
@@ -368,7 +365,7 @@ class JointInitializer(AbstractInitializer):
     @functools.cached_property
     def guide(self) -> Callable[[Array, Array, Observations], tuple[Array, Array, Array]]:
         """NumPyro's guide around a mode, compiled."""
-        return JitOnce(functools.partial(_guide, self.program))
+        return self.program.once("guide", functools.partial(_guide, self.program))
 
     @override
     def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:
@@ -392,11 +389,11 @@ class JointInitializer(AbstractInitializer):
 
     @override
     def prepare_target(self, data: Observations) -> Target:
-        density: Density = self.program.potential_jit
+        density: AbstractDensity = self.program
         given: object = data
         starts, metric = np.zeros((1, self.program.size)), np.eye(self.program.size)
         if self.reparam is not None:
-            density, given = self.reparam.potential_jit, self.reparam.inputs_like(data)
+            density, given = self.reparam, self.reparam.inputs_like(data)
             self.reparam.value_and_gradient.begin(starts[0], given)
         return Target(density, given, lambda z: (0.0, z), starts, metric)
 

@@ -37,20 +37,33 @@ class ModelParts:
 
     def key(self, *further: object) -> str:
         """A text that is equal for parts whose compiled programs are the same."""
-        # Not the priors themselves: distributions store what they have computed.
-        stated = [
-            (name, jax.tree.leaves(prior), str(jax.tree.structure(prior)))
-            for name, prior in self.priors.items()
-        ]
+        stated = {name: _stated(prior) for name, prior in self.priors.items()}
         scene = dataclasses.replace(self.scene)  # without its ledger
-        code = (self.model, scene, self.links, *map(type, self.priors.values()))
-        return fingerprint(self.model, scene, stated, self.links, *further, code=code)
+        return fingerprint(self.model, scene, stated, self.links, *further, code=self._code)
+
+    @property
+    def _code(self) -> tuple[object, ...]:
+        scene = dataclasses.replace(self.scene)
+        return self.model, scene, self.links, *map(type, self.priors.values())
+
+    @property
+    def has_own_code(self) -> bool:
+        """Whether a function or class of the user's own is among the parts."""
+        return uses_own_code(*self._code)
 
     @property
     def is_padded(self) -> bool:
         """Whether captures with other numbers of views may share the programs of the model."""
         # Code of the user's own need not mask what is not valid, so it is given no padding.
         return not uses_own_code(self.model, self.scene, self.links)
+
+
+def _stated(value: object) -> object:
+    """A prior as its own arguments, in one order; not what it has computed and stored since."""
+    if not isinstance(value, dist.Distribution):
+        return jax.tree.leaves(value), str(jax.tree.structure(value))
+    names = sorted({*value.gather_pytree_data_fields(), *value.gather_pytree_aux_fields()})
+    return type(value), [(name, _stated(vars(value).get(name))) for name in names]
 
 
 def layout_of(data: Observations) -> tuple[str, ...]:

@@ -60,6 +60,15 @@ class Draw(NamedTuple):
 class AbstractDensity[Given](abc.ABC):
     """A log density of flat vectors, with what is compiled of it for all captures of a layout."""
 
+    @property
+    def key(self) -> str:
+        """A text that tells it from every other density, in any process; empty where none does."""
+        return ""
+
+    def once(self, name: str, function: Callable) -> JitOnce:
+        """A function of this density, compiled; no other function of it has that name."""
+        return JitOnce(function, self.key and f"{self.key} {name}")
+
     @abc.abstractmethod
     def potential(self, z: Float[Array, " size"], given: Given) -> Float[Array, ""]:
         """Minus the log density of a vector, up to a constant."""
@@ -72,7 +81,7 @@ class AbstractDensity[Given](abc.ABC):
     @functools.cached_property
     def value_and_gradient(self) -> JitOnce:
         """The potential with its gradient, compiled."""
-        return JitOnce(jax.value_and_grad(self.potential_jit))
+        return self.once("value_and_gradient", jax.value_and_grad(self.potential_jit))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -92,6 +101,7 @@ class Program(AbstractDensity[Observations]):
     observed: tuple[str, ...]
     size: int
     unravel: Callable[[Float[Array, " size"]], dict[str, Array]]
+    key: str = ""
 
     @override
     def potential(self, z: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
@@ -254,7 +264,7 @@ class Program(AbstractDensity[Observations]):
                 0, count, lambda i, z: z.at[i].set(self.from_prior(wrapped[i], data)), zeros
             )
 
-        return JitOnce(draw)
+        return self.once("drawn_from_prior", draw)
 
     @functools.cached_property
     def described(self) -> JitOnce:
@@ -264,7 +274,7 @@ class Program(AbstractDensity[Observations]):
             rows = jax.random.wrap_key_data(keys), predicts, z
             return jax.lax.map(lambda row: self.describe(row[0], row[2], data, row[1]), rows)
 
-        return JitOnce(describe)
+        return self.once("described", describe)
 
     def begin_described(self, data: Observations) -> None:
         """Begin to compile the description of a block of draws."""
@@ -289,18 +299,18 @@ class Program(AbstractDensity[Observations]):
         def evaluate(z: Array, data: Observations) -> tuple[Array, dict[str, Array]]:
             return jax.lax.map(lambda z: self.parameters_and_potential(z, data)[::-1], z)
 
-        return JitOnce(evaluate)
+        return self.once("evaluated", evaluate)
 
     @functools.cached_property
     def parameters_of_chains(self) -> JitOnce:
         """`parameters` of chains of draws, (chain, draw, size), compiled."""
         over_draws = jax.vmap(self.parameters, in_axes=(0, None))
-        return JitOnce(jax.vmap(over_draws, in_axes=(0, None)))
+        return self.once("parameters_of_chains", jax.vmap(over_draws, in_axes=(0, None)))
 
     @functools.cached_property
     def slopes(self) -> Callable[[Array], dict[str, Array]]:
         """Jacobian of `constrain`, compiled."""
-        return JitOnce(jax.jacfwd(self.constrain))
+        return self.once("slopes", jax.jacfwd(self.constrain))
 
 
 def _total(terms: Mapping[str, Array], data: Observations) -> Array:

@@ -23,14 +23,14 @@ from jaxtyping import Array, Float
 from numpyro import infer
 
 from polar_bayes.inference.compiled_model import CompiledModel
-from polar_bayes.inference.initialization import Density, Target
+from polar_bayes.inference.initialization import Target
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
-from polar_bayes.inference.program import Values, first_key, split_key
+from polar_bayes.inference.program import AbstractDensity, Values, first_key, split_key
 from polar_bayes.inference.result import Provenance
 from polar_bayes.methods.importance import ONE_ROUND, suits_profiles, tail_shares
 from polar_bayes.methods.method import AbstractMethod, PosteriorDraws
-from polar_bayes.numerics.compile import JitOnce, compiled
+from polar_bayes.numerics.compile import compiled
 from polar_bayes.numerics.mcse import measure
 from polar_bayes.progress import Progress
 
@@ -162,7 +162,7 @@ class Nuts(AbstractMethod):
         return AbstractMethod.run_batch(dataclasses.replace(self, threads=1), batch)
 
 
-def _make_sampler(_: CompiledModel, settings: tuple[Callable, "Static"]) -> "Sampler":
+def _make_sampler(_: CompiledModel, settings: tuple[AbstractDensity, "Static"]) -> "Sampler":
     return Sampler(*settings)
 
 
@@ -304,12 +304,12 @@ class Static(NamedTuple):
 class Sampler:
     """NumPyro's NUTS as two functions of arrays: start a chain, advance it by a block."""
 
-    def __init__(self, density: Density, static: Static) -> None:
+    def __init__(self, density: AbstractDensity, static: Static) -> None:
         self.static = static
         # From a state, the data and a number of draws to the state after them, and these.
-        self.advance = JitOnce(self._advance)
+        self.advance = density.once(f"{static}", self._advance)
         self._init, self._next = infer.hmc.hmc(
-            potential_fn_gen=lambda given: lambda z: density(z, given), algo="NUTS"
+            potential_fn_gen=lambda given: lambda z: density.potential_jit(z, given), algo="NUTS"
         )
         self._begin = compiled(self._start)
 

@@ -21,7 +21,7 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 
 from polar_bayes.errors import FitError
-from polar_bayes.numerics.kept_programs import KeptProgram, kept_program
+from polar_bayes.numerics.kept_programs import KeptProgram, cache_hits, kept_program
 from polar_bayes.paths import compiled_folder, make_private
 from polar_bayes.progress import Progress
 
@@ -175,8 +175,10 @@ class _Compilation:
     def _make(self) -> Any:
         found = None if self._kept is None or self._lowered is not None else self._kept.load()
         if found is None:
-            found = (self._lowered or self._lower()).compile()
-            if self._kept is not None:
+            lowered, hits = self._lowered or self._lower(), cache_hits()
+            found = lowered.compile()
+            # XLA cannot write a program again that JAX's own cache has read.
+            if self._kept is not None and cache_hits() == hits:
                 _COMPILER_THREAD.submit(self._kept.save, found)
         self._lowered = None
         return found

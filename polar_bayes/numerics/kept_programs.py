@@ -13,6 +13,7 @@ import os
 import pickle
 import platform
 import shutil
+import threading
 from collections.abc import Callable, Iterable
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -22,12 +23,28 @@ from typing import Any
 import jax
 from jax.experimental import serialize_executable
 
+from polar_bayes.namespace import IMPORTED
 from polar_bayes.paths import compiled_folder
 
 LIBRARIES = ("jax", "jaxlib", "numpyro", "equinox", "tinygp", "numpy")
 
 MOST_ENVIRONMENTS = 3
 """Of sources, libraries and settings, whose programs stay on the disk."""
+
+_HITS = threading.local()
+
+
+def _count(event: str, **_: object) -> None:
+    if event == "/jax/compilation_cache/cache_hits":
+        _HITS.count = cache_hits() + 1
+
+
+jax.monitoring.register_event_listener(_count)
+
+
+def cache_hits() -> int:
+    """Programs that this thread has read from JAX's own cache."""
+    return getattr(_HITS, "count", 0)
 
 
 class KeptProgram:
@@ -76,9 +93,12 @@ def kept_program(key: str, arguments: tuple) -> KeptProgram | None:
         return None
     if jax.device_count() > 1 or jax.default_backend() != "cpu" or jax.config.jax_default_device:
         return None  # a program runs where it was compiled
+    environment = _environment()
+    if not environment:
+        return None
     leaves, tree = jax.tree.flatten(arguments)
-    described = [str(tree), *(_described(leaf) for leaf in leaves), str(jax.config.jax_enable_x64)]
-    return KeptProgram(folder / "programs" / _environment() / _digest([key, *described]), arguments)
+    words = [key, str(tree), *map(_described, leaves), str(jax.config.jax_enable_x64)]
+    return KeptProgram(folder / "programs" / environment / _digest(words), arguments)
 
 
 def _described(leaf: Any) -> str:
@@ -92,12 +112,15 @@ def _digest(texts: Iterable[str]) -> str:
 
 @functools.cache
 def _environment() -> str:
-    """What all programs of a process depend on, as one word."""
-    models = find_spec("polar_bayes.models")
-    roots = {Path(__file__).parents[1], *map(Path, models.submodule_search_locations or ())}
-    sources = sorted(
-        path for root in roots for path in root.rglob("*.*") if path.suffix in (".py", ".csv")
-    )
+    """What all programs of a process depend on, as one word; none where sources have changed."""
+    packages = filter(None, map(find_spec, ("polar_bayes", "polar_bayes.models")))
+    roots = {
+        Path(root) for package in packages for root in package.submodule_search_locations or ()
+    }
+    files = (path for root in roots for path in root.rglob("*.*"))
+    sources = sorted(path for path in files if path.suffix in (".py", ".csv"))
+    if any(path.stat().st_ctime > IMPORTED for path in sources):
+        return ""  # what was imported is not what is there
     settings = {n: x for n, x in jax.config.values.items() if "cache" not in n and "log" not in n}
     processor = Path("/proc/cpuinfo")
     lines = processor.read_text().splitlines() if processor.is_file() else [platform.processor()]

@@ -1,5 +1,7 @@
 """The loop around the NUTS kernel, on a normal distribution of known width."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,18 @@ import pytest
 
 import polar_bayes as pb
 from polar_bayes.inference.initialization import Target
+from polar_bayes.inference.program import AbstractDensity
 from polar_bayes.methods import nuts
+
+
+class OfFunction(AbstractDensity):
+    """A density that is given as a function."""
+
+    def __init__(self, potential: Callable) -> None:
+        self._potential = potential
+
+    def potential(self, z, given):
+        return self._potential(z, given)
 
 
 def density(z: jax.Array, center: jax.Array) -> jax.Array:
@@ -32,7 +45,7 @@ def test_how_draws_are_cut_into_blocks_changes_nothing() -> None:
         for block in (60, 35):  # 60 divides the warm-up and the draws, 35 does neither
             settings = pb.methods.Nuts(chains=2, warmup=60, draws=120, most_draws=120, block=block)
             here = target(3, 2)
-            sampler = nuts.Sampler(density, settings.static(here))
+            sampler = nuts.Sampler(OfFunction(density), settings.static(here))
             told.append(nuts.sample(sampler, here, jax.random.key(1), settings))
     (z, stats, *_), (again, others, *_) = told
     assert z.shape == (2, 120, 3)
@@ -57,7 +70,7 @@ def test_chains_share_what_they_adapted() -> None:
                     np.asarray(z / widths**2),
                 ),
             )
-            sampler = nuts.Sampler(here.density, settings.static(here))
+            sampler = nuts.Sampler(OfFunction(here.density), settings.static(here))
             z, stats, *_ = nuts.sample(sampler, here, jax.random.key(2), settings)
             assert len(np.unique(stats["step_size"])) == 1
             taken.append(stats["n_steps"].mean())
@@ -82,7 +95,7 @@ def test_where_draws_diverge_it_changes_nothing_either() -> None:
             )
             here = target(3, 2)._replace(density=funnel, given=jnp.asarray(3.0))
             here = here._replace(potential=jax.value_and_grad(lambda z: funnel(z, 3.0)))
-            sampler = nuts.Sampler(funnel, settings.static(here))
+            sampler = nuts.Sampler(OfFunction(funnel), settings.static(here))
             told.append(nuts.sample(sampler, here, jax.random.key(1), settings))
     z, stats, reached, halvings = told[0]
     assert halvings > 0

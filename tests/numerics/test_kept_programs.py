@@ -1,0 +1,71 @@
+"""Programs on the disk: what the next process loads, and what it does not trust."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FIT = """
+import sys
+import jax
+import numpy as np
+import polar_bayes as pb
+from compilations import compilations
+
+capture = pb.simulate("glass", scene="goniometer", protocol=pb.simulation.Protocol(views=9), seed=2)
+priors = {"leakage": pb.priors.HalfNormal(float(sys.argv[1]))}
+with compilations() as compiled:
+    result = pb.fit(capture.isel(wavelength=0), priors=priors, method="laplace", seed=0)
+print(len(compiled), repr(float(pb.summary(result).loc["refractive_index", "mean"])))
+"""
+
+
+def fitted(cache: Path, leakage: float = 0.01) -> tuple[int, float]:
+    """How many programs a new process traces and compiles for a fit, and the answer."""
+    clean = {name: x for name, x in os.environ.items() if not name.startswith("JAX_")}
+    tests = str(Path(__file__).parents[1])
+    environment = clean | {"XDG_CACHE_HOME": str(cache), "PYTHONPATH": tests}
+    words = [sys.executable, "-c", FIT, str(leakage)]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=True)
+    count, answer = done.stdout.split()
+    return int(count), float(answer)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="module")
+def first(cache: Path) -> tuple[int, float]:
+    return fitted(cache)
+
+
+def programs(cache: Path) -> list[Path]:
+    return [path for path in cache.rglob("compiled/programs/*/*") if path.is_file()]
+
+
+def test_the_next_process_traces_no_program_of_the_model_and_finds_the_same(cache, first) -> None:
+    kept = programs(cache)
+    assert len(kept) >= 4
+    count, answer = fitted(cache)
+    assert answer == first[1]
+    assert count <= first[0] - len(kept)
+    assert programs(cache) == kept
+
+
+@pytest.mark.thorough
+def test_another_prior_is_another_program(cache, first) -> None:
+    kept = len(programs(cache))
+    _, answer = fitted(cache, leakage=0.2)
+    assert answer != first[1]
+    assert len(programs(cache)) > kept
+
+
+@pytest.mark.thorough
+def test_what_is_damaged_is_compiled_again(cache, first) -> None:
+    for path in programs(cache):
+        path.write_bytes(path.read_bytes()[:100])
+    assert fitted(cache)[1] == first[1]
