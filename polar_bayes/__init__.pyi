@@ -74,6 +74,7 @@ from .physics.surface import (
 )
 from .priors import PRIORS as PRIORS
 from .reporting import plots as plots
+from .reporting.explore import explore as explore
 from .reporting.plots import plot as plot
 from .reporting.report import report as report
 from .reporting.report import show as show

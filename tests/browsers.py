@@ -3,6 +3,7 @@
 import base64
 import contextlib
 import shutil
+import urllib.parse
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -77,7 +78,9 @@ def faults(driver: webdriver.Chrome) -> list[str]:
     found = [f"console: {said}" for said in console(driver)]
     driver.execute_script(HIDDEN)
     found += [f"no picture: {name}" for name in driver.execute_script(IMAGES)]
-    found += [f"dead link: {address}" for address in driver.execute_script(LINKS)]
+    folder = Path(urllib.parse.unquote(urllib.parse.urlsplit(driver.current_url).path)).parent
+    dead = (x for x in driver.execute_script(LINKS) if x[0] == "#" or not (folder / x).is_file())
+    found += [f"dead link: {address}" for address in dead]
     room, needed = sideways(driver)
     return found + ([f"scrolls sideways: {needed} in {room}"] if needed > room else [])
 

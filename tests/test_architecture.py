@@ -53,6 +53,7 @@ HOMES = {
     "matplotlib": ("polar_bayes.reporting",),
     "arviz_plots": ("polar_bayes.reporting",),
     "jinja2": ("polar_bayes.reporting",),
+    "bokeh": ("polar_bayes.reporting",),
     "click": ("polar_bayes.cli",),
     "netCDF4": ("polar_bayes.capture",),
     "PIL": ("polar_bayes.importers",),

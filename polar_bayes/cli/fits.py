@@ -318,6 +318,7 @@ def scenes(capture: Path, out: Path | None, as_json: bool, **settings: Any) -> i
 @out_option(FOLDER, "Folder to write.")
 @option("--next-views/--no-next-views", default=True, help="Of a fit: which views to take next.")
 @option("--truth", type=INPUT, help="Of a map: its simulated capture.")
+@option("--capture", type=INPUT, help="Of a map: its capture, whose readings a click shows.")
 @option("--uncorrected", type=INPUT, help="With --truth: the same map without weights, to compare.")
 @option(
     "--compare", "comparisons", type=INPUT, multiple=True,
@@ -328,6 +329,7 @@ def report(
     out: Path,
     next_views: bool,
     truth: Path | None,
+    capture: Path | None,
     uncorrected: Path | None,
     comparisons: tuple[Path, ...],
 ) -> None:
@@ -344,8 +346,15 @@ def report(
             truth=None if truth is None else pb.maps.open_capture(truth),
             uncorrected=None if uncorrected is None else pb.maps.open_map(uncorrected),
             comparisons=_load_all(comparisons, "calibration") or None,
+            capture=None if capture is None else pb.maps.open_capture(capture),
         )
     click.echo(f"report: {page}")
+    if "status" in result:
+        from polar_bayes.reporting.page import EXPLORER, has_explorer
+        from polar_bayes.reporting.text import no_explorer
+
+        found = f"map to point at: {page.with_name(EXPLORER)}" if has_explorer() else no_explorer()
+        click.echo(found)
 
 
 def _is_new_fit(result: "Result") -> bool:

@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 
 from polar_bayes.diagnostics.coverage import INTERVALS, map_coverage, map_scalars
 from polar_bayes.diagnostics.parameters import Scalar
-from polar_bayes.diagnostics.view import Provenance
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.batching import IMAGE, MIN_VIEWS, Status, cut
 from polar_bayes.inference.result import provenance_of
@@ -225,9 +224,13 @@ def map_card(result: xr.Dataset) -> page.Card:
 
 
 def map_page(
-    maps: xr.Dataset, truth: xr.Dataset | None = None, uncorrected: xr.Dataset | None = None
+    maps: xr.Dataset,
+    truth: xr.Dataset | None = None,
+    uncorrected: xr.Dataset | None = None,
+    capture: xr.Dataset | None = None,
 ) -> page.Page:
-    """The page of a map."""
+    """The page of a map; the readings of its capture are on the one to point at."""
+    del capture
     titles = parameter_titles(map_scalars(maps))
     if any(name not in maps for name in TRUST):
         raise FitError("it holds no maps", where="report", hint="give what fit_pixels returns")
@@ -254,7 +257,7 @@ def map_page(
     if not shared.empty:
         tables.append(shared_table(shared))
     sections = [
-        page.Section("maps", "Maps", list(_pictures(maps, list(titles)))),
+        page.Section("maps", "Maps", [_explorer(), *_pictures(maps, list(titles))]),
         page.Section("pixels", "Pixels", [*_pixel_tables(counts), *_criticism_table(maps)]),
         page.Section("parameters", "Parameters", tables),
         page.Section("coverage", "Coverage", coverage),
@@ -263,7 +266,7 @@ def map_page(
     swapped = text.swapped_sentence(provenance)
     return page.Page(
         kind="Map report",
-        name=_name(maps, provenance, truth),
+        name=map_name(maps, truth),
         subtitles=[f"{size} pixels. {text.made_by(provenance, method)}", *filter(None, [swapped])],
         headline=headline,
         passed=passed,
@@ -275,6 +278,13 @@ def map_page(
         sections=sections,
         footer="Computed from the maps of every pixel, which stay where they are.",
     )
+
+
+def _explorer() -> page.Block:
+    """Where the map is that one can point at, or why there is none."""
+    if page.has_explorer():
+        return page.Link("The same map to point at, pixel by pixel.", page.EXPLORER)
+    return text.no_explorer()
 
 
 def _check_uncorrected(maps: xr.Dataset, truth: xr.Dataset | None, uncorrected: xr.Dataset) -> None:
@@ -290,10 +300,10 @@ def _check_uncorrected(maps: xr.Dataset, truth: xr.Dataset | None, uncorrected: 
         raise FitError("it was corrected as well", where=where, hint=hint)
 
 
-def _name(maps: xr.Dataset, provenance: Provenance, truth: xr.Dataset | None) -> str:
+def map_name(maps: xr.Dataset, truth: xr.Dataset | None = None) -> str:
     """The name of the capture, or of the file of the map."""
     file = Path(str(maps.encoding.get("source", "map"))).stem
-    names = [text.capture_name(provenance, ""), maps.attrs.get("name")]
+    names = [text.capture_name(provenance_of(maps), ""), maps.attrs.get("name")]
     names += [None if truth is None else truth.attrs.get("name"), file]
     return one_line(str(next(filter(None, names))))
 
@@ -317,7 +327,7 @@ def _pictures(maps: xr.Dataset, scalars: Sequence[Scalar]) -> Iterator[page.Pict
     for at in range(0, len(names), 4):  # more columns would be too small to read
         some = names[at : at + 4]
         spectral = [name for name in some if "wavelength" in dims[name]]
-        for turn, wavelength in enumerate(_wavelengths(maps) if spectral else [None]):
+        for turn, wavelength in enumerate(shown_wavelengths(maps) if spectral else [None]):
             shown = some if turn == 0 else spectral
             variables = [f"{name}{ending}" for name in shown for ending in ("", "_quantile")]
             place = "" if wavelength is None else f" at {wavelength:g} nm"
@@ -328,7 +338,7 @@ def _pictures(maps: xr.Dataset, scalars: Sequence[Scalar]) -> Iterator[page.Pict
             yield page.picture(figure, "map.figure_maps", instead=caption, more=more, names=drawn)
 
 
-def _wavelengths(maps: xr.Dataset) -> list[float]:
+def shown_wavelengths(maps: xr.Dataset) -> list[float]:
     """The first, the middle and the last: a map may have hundreds."""
     known = maps["wavelength"].to_numpy().astype(float).tolist()
     return list(dict.fromkeys([known[0], known[len(known) // 2], known[-1]]))
@@ -493,4 +503,4 @@ def _coverage_cells(table: pd.DataFrame, label: str, claimed: int) -> list[str]:
     return [f"{held} (too few)" if is_low else held, known, of_read]
 
 
-REPORT = page.Report(map_page, map_card, plot_maps, ("truth", "uncorrected"))
+REPORT = page.Report(map_page, map_card, plot_maps, ("truth", "uncorrected", "capture"))

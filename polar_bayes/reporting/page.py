@@ -9,6 +9,7 @@ import csv
 import dataclasses
 import functools
 import importlib.resources
+import importlib.util
 import io
 import pkgutil
 import tomllib
@@ -29,6 +30,12 @@ from polar_bayes.repr_html import Row, Table
 from polar_bayes.results import kind_of
 
 PAGE = "index.html"
+
+EXPLORER = "explore.html"
+"""The page of a map that one can point at, beside the report."""
+
+INSTALL = "pip install 'polar_bayes[explore]'"
+"""What that page needs."""
 
 type Card = tuple[list[str], Table, bool]
 """What `polar_bayes.show` has of a result: sentences, a table, and whether it may be used."""
@@ -124,6 +131,13 @@ class Bullets(NamedTuple):
     sentences: tuple[str, ...]
 
 
+class Link(NamedTuple):
+    """A sentence that leads to another page of the same folder."""
+
+    text: str
+    address: str
+
+
 class Details(NamedTuple):
     """Blocks or a program that unfold on request."""
 
@@ -132,7 +146,7 @@ class Details(NamedTuple):
     code: str = ""
 
 
-type Block = str | Table | Picture | Facts | Heading | Bullets | Details
+type Block = str | Table | Picture | Facts | Heading | Bullets | Link | Details
 
 
 @dataclasses.dataclass
@@ -167,11 +181,12 @@ class Page:
     @property
     def html(self) -> str:
         """The page as HTML; every text is escaped."""
-        return _template().render(page=self)
+        return template("page.html.j2").render(page=self)
 
 
 @functools.cache
-def _template() -> Template:
+def template(name: str) -> Template:
+    """A page that is to be filled in; every text is escaped."""
     environment = Environment(
         loader=PackageLoader("polar_bayes.reporting"),
         autoescape=True,
@@ -181,13 +196,18 @@ def _template() -> Template:
     )
     # Tables with more rows scroll in a box of their own.
     environment.globals |= {"csv_link": csv_link, "long_table": 40}
-    return environment.get_template("page.html.j2")
+    return environment.get_template(name)
 
 
 @functools.cache
 def _captions() -> dict[str, Any]:
-    file = importlib.resources.files("polar_bayes.reporting") / "templates" / "captions.toml"
-    return tomllib.loads(file.read_text(encoding="utf-8"))
+    return tomllib.loads(read_template("captions.toml"))
+
+
+def read_template(name: str) -> str:
+    """A file of `templates/` as it is."""
+    file = importlib.resources.files("polar_bayes.reporting") / "templates" / name
+    return file.read_text(encoding="utf-8")
 
 
 def caption(key: str, **values: object) -> str:
@@ -238,13 +258,18 @@ def _as_text(value: object) -> str:
     return str(value)
 
 
+def has_explorer() -> bool:
+    """Whether the library is installed by which a map becomes a page that one can point at."""
+    return importlib.util.find_spec("bokeh") is not None
+
+
 def write_page(
     folder: Path, page: str, others: Mapping[str, Callable[[Path], object]] | None = None
 ) -> Path:
     """Write a page and the files that belong to it; an older report in the folder is replaced."""
     with write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    is_report = _is_page(folder / PAGE)
+    is_report = is_page(folder / PAGE)
     names = (*(others or {}), PAGE)
     files = {name: check_output(folder / name, lambda _: is_report) for name in names}
     with write_errors(folder), temporary_folder(folder) as unfinished:
@@ -256,7 +281,8 @@ def write_page(
     return folder / PAGE
 
 
-def _is_page(file: Path) -> bool:
+def is_page(file: Path) -> bool:
+    """Whether a file is a page of this package, which may be replaced."""
     try:
         return b'<meta name="generator" content="polar_bayes">' in file.read_bytes()[:1024]
     except OSError:

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import inspect
 import os
+import pkgutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -17,11 +18,11 @@ from polar_bayes.capture.schema import validate
 from polar_bayes.errors import FitError
 from polar_bayes.expressions import short_text
 from polar_bayes.inference.result import PROVENANCE, provenance_of
-from polar_bayes.observation.data import ANGLES
+from polar_bayes.observation.data import ANGLES, READINGS
 from polar_bayes.paths import as_path
 from polar_bayes.priors import describe_prior, prior_card
 from polar_bayes.reporting import text
-from polar_bayes.reporting.page import report_of, write_page
+from polar_bayes.reporting.page import EXPLORER, has_explorer, report_of, write_page
 from polar_bayes.reporting.style import in_default_style
 from polar_bayes.repr_html import DisplaySummary, HTMLRepr, Row, Table
 from polar_bayes.results import kind_of, save, summary, verdict
@@ -32,6 +33,7 @@ MAX_ROWS = 40
 HINTS = {
     "truth": "leave it out: a fit carries the truth of its capture",
     "uncorrected": "leave it out: a fit carries the truth of its capture",
+    "capture": "leave it out: a fit carries its readings",
     "comparisons": "leave it out, or give what polar_bayes.calibrate returns",
 }
 
@@ -44,14 +46,16 @@ def report(
     truth: xr.Dataset | None = None,
     uncorrected: xr.Dataset | None = None,
     comparisons: Mapping[str, xr.DataTree] | None = None,
+    capture: xr.Dataset | None = None,
 ) -> Path:
     """Write the standard report of any result, or of several fits side by side: one `index.html`.
 
     The page needs no network, no script and no other file. Everything on it is computed from the
     result, so a report of a file read back is the same report. The folder of a fit also holds
     `result.nc`, that of a calibration `calibration.nc`, of an accuracy study `accuracy.nc`; a map,
-    which may be large, stays where it is. A fit whose tree has a group `accuracy`
-    (`result["accuracy"] = study["accuracy"]`) shows it.
+    which may be large, stays where it is. Beside the page of a map is `explore.html`, on which one
+    can point at its pixels (`polar_bayes.explore`), where Bokeh is installed. A fit
+    whose tree has a group `accuracy` (`result["accuracy"] = study["accuracy"]`) shows it.
 
     Args:
         result: A tree that `polar_bayes.fit`, `polar_bayes.calibrate` or `polar_bayes.accuracy`
@@ -64,6 +68,8 @@ def report(
             the Laplace approximation alone, whose coverage is compared.
         comparisons: Of a calibration: others of the same layout, by a name such as their method
             ("laplace"), with which it is compared.
+        capture: Of maps: the image of which they were made, whose readings `explore.html` shows;
+            by default `truth`, where it holds readings.
 
     Returns:
         The path of the page.
@@ -76,8 +82,15 @@ def report(
             of a report.
     """
     folder = as_path(directory, "report")
-    page = render(result, truth=truth, uncorrected=uncorrected, comparisons=comparisons)
-    files = {}
+    options = {"truth": truth, "uncorrected": uncorrected, "comparisons": comparisons}
+    page = render(result, **options, capture=capture)
+    files: dict[str, Callable[[Path], object]] = {}
+    if "capture" in report_of(result).options and has_explorer():
+        has_readings = truth is not None and any(name in truth for name in READINGS)
+        image = truth if capture is None and has_readings else capture
+        # That file computes with JAX, and is loaded for maps only.
+        explore = pkgutil.resolve_name("polar_bayes.reporting.explore:explore")
+        files[EXPLORER] = explore(result, image).save
     if file := report_of(result).file:
         files[file] = functools.partial(save, cast(xr.DataTree, result))
     return write_page(folder, page, files)

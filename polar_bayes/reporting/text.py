@@ -30,6 +30,7 @@ from polar_bayes.errors import one_line
 from polar_bayes.inference.batching import MIN_VIEWS
 from polar_bayes.methods.registry import METHODS
 from polar_bayes.numerics.psis import MAX_PARETO_K
+from polar_bayes.reporting.page import INSTALL
 from polar_bayes.reporting.style import QUANTITIES, coordinate_labels, short_title
 from polar_bayes.results import MIN_GOOD_SHARE, verdict
 
@@ -515,6 +516,11 @@ def map_headline(counts: pd.DataFrame) -> tuple[str, bool]:
     share = count_percent(good, read)
     headline = f"{good:,} of {read:,} pixels that were read have an answer ({share})."
     return headline, good >= MIN_GOOD_SHARE * read
+
+
+def no_explorer() -> str:
+    """Why a report has no map to point at."""
+    return f"There is no map to point at, because Bokeh is not installed: {INSTALL}."
 
 
 def pixel_sentences(counts: pd.DataFrame) -> list[str]:

@@ -1,5 +1,6 @@
 """Commands with a map: finished ones are resumed and reported, told by the end of their name."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import polar_bayes as pb
 from polar_bayes.cli import main
 from polar_bayes.maps import store
 from polar_bayes.maps.fit_map import blank
+from polar_bayes.reporting.page import INSTALL
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -27,11 +29,20 @@ def files(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_map_has_a_page(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_map_has_a_page(
+    files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     words = ["report", str(files / "map.zarr"), "--out", str(files / "report")]
     assert main(words) == 0
     page = files / "report" / "index.html"
-    assert capsys.readouterr().out == f"report: {page}\n"
+    explorer = files / "report" / "explore.html"
+    assert capsys.readouterr().out == f"report: {page}\nmap to point at: {explorer}\n"
+    assert "The page was made without the capture" in explorer.read_text()
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "bokeh", None)
+        assert main(words) == 0
+    told = capsys.readouterr().out.splitlines()[1]
+    assert told == f"There is no map to point at, because Bokeh is not installed: {INSTALL}."
     assert "Map report: map" in page.read_text()
     words += ["--truth", str(files / "leaf.zarr"), "--uncorrected", str(files / "bare.zarr")]
     assert main(words) == 0

@@ -65,5 +65,6 @@ def test_shares_are_never_rounded_to_all_or_nothing() -> None:
 
 def test_the_folder_holds_the_page(tmp_path: Path) -> None:
     page = pb.report(mixed(), tmp_path / "report", truth=truth())
-    assert [path.name for path in (tmp_path / "report").iterdir()] == ["index.html"]
+    names = sorted(path.name for path in (tmp_path / "report").iterdir())
+    assert names == ["explore.html", "index.html"]
     assert page.read_text() == render(mixed(), truth=truth())
