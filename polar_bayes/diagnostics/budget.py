@@ -33,9 +33,6 @@ from polar_bayes.frames import PrintedFrame
 from polar_bayes.physics.part import notation
 from polar_bayes.setups import check_uncertainty
 
-OWN = ("noise", "prior")
-"""What contributes beside the set-up."""
-
 
 def budget(
     result: xr.DataTree | FitView, *, known: Mapping[str, float] | None = None
@@ -66,7 +63,10 @@ def budget(
         )
     errors, stated = _errors(fit), _stated(fit)
     asked = _asked(stated, known or {})
-    densities = _densities(fit, {each.name for each in errors.values()})
+    # Of the readings, and of all priors but those of the input quantities.
+    names = {each.name for each in errors.values()}
+    likelihood = total_density(fit.result, "log_likelihood")
+    densities = [likelihood, total_density(fit.result, "log_prior", names)]
     rows = {}
     for scalar in fit.scalars:
         if scalar.is_material:
@@ -74,7 +74,7 @@ def budget(
                 joint = _covariance(scalar, errors)
                 noise = _share_of_noise(scalar, densities)
                 rows[scalar.label] = _row(joint, noise, stated, asked)
-    columns = ["sd", "perfect", *OWN, *stated.index]
+    columns = ["sd", "perfect", "noise", "prior", *stated.index]
     table = PrintedFrame.from_dict(rows, orient="index", columns=columns)
     table.attrs["known"] = asked.to_dict()
     return table
@@ -140,12 +140,6 @@ def _asked(stated: pd.Series, known: Mapping[str, float]) -> pd.Series:
             raise FitError("it is no input quantity of this fit", where=f"known: {name}", hint=hint)
         check_uncertainty(value, f"known: {name}")
     return pd.Series({**stated.to_dict(), **known}, dtype=float)
-
-
-def _densities(fit: FitView, errors: set[str]) -> list[np.ndarray | None]:
-    """Log densities of the readings, and of all priors but those of the input quantities."""
-    likelihood = total_density(fit.result, "log_likelihood")
-    return [likelihood, total_density(fit.result, "log_prior", errors)]
 
 
 def _share_of_noise(scalar: Scalar, densities: list[np.ndarray | None]) -> float:

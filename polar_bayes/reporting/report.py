@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
+import matplotlib.style
 import numpy as np
 import xarray as xr
 from numpyro import distributions as dist
@@ -22,21 +23,14 @@ from polar_bayes.paths import as_path
 from polar_bayes.priors import describe_prior, prior_card
 from polar_bayes.reporting import text
 from polar_bayes.reporting.page import report_of, write_page
-from polar_bayes.reporting.style import in_default_style
 from polar_bayes.repr_html import DisplaySummary, HTMLRepr, Row, Table
 from polar_bayes.results import kind_of, save, summary, verdict
 
 MAX_ROWS = 40
 """Rows of a table in a notebook or a terminal."""
 
-HINTS = {
-    "truth": "leave it out: a fit carries the truth of its capture",
-    "uncorrected": "leave it out: a fit carries the truth of its capture",
-    "comparisons": "leave it out, or give what polar_bayes.calibrate returns",
-}
 
-
-@in_default_style
+@matplotlib.style.context("default")  # whatever style the user has, the same result: the same page
 def report(
     result: xr.DataTree | xr.Dataset | Mapping[str, xr.DataTree],
     directory: str | os.PathLike[str],
@@ -89,8 +83,11 @@ def render(result: Any, **options: Any) -> str:
     given = {name: value for name, value in options.items() if value is not None}
     for name in given:
         if name not in own.options:
-            owner = "calibrations" if name == "comparisons" else "maps"
-            raise FitError(f"it goes with {owner} only", where=f"report: {name}", hint=HINTS[name])
+            owner, hint = "maps", "leave it out: a fit carries the truth of its capture"
+            if name == "comparisons":
+                owner = "calibrations"
+                hint = "leave it out, or give what polar_bayes.calibrate returns"
+            raise FitError(f"it goes with {owner} only", where=f"report: {name}", hint=hint)
     return own.page(result, **given).html
 
 
