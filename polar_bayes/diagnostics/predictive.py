@@ -25,8 +25,6 @@ from polar_bayes.diagnostics.view import FitView, once
 from polar_bayes.numerics.psis import MAX_PARETO_K, smooth
 
 PROBABILITIES = (0.5, 0.8, 0.95)
-COMPARABLE = MappingProxyType({"valid": True, "saturated": False})
-"""Flags of readings that can be compared with a prediction."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -97,9 +95,11 @@ def _uniform_band(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def usable_readings(
-    result: xr.DataTree, name: str, flags: Mapping[str, bool] = COMPARABLE
+    result: xr.DataTree,
+    name: str,
+    flags: Mapping[str, bool] = MappingProxyType({"valid": True, "saturated": False}),
 ) -> np.ndarray:
-    """Which readings of a variable are finite and have these flags."""
+    """Which readings are finite and have these flags: by default, those of a fair comparison."""
     observed = result["observed_data"].to_dataset()[name]
     usable = np.isfinite(observed.to_numpy())
     constants = result["constant_data"].to_dataset() if "constant_data" in result.children else {}

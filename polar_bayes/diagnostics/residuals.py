@@ -112,7 +112,7 @@ def _readings(result: xr.DataTree, variable: FlatVariable) -> pd.DataFrame:
     error = constants.get(f"{variable.name}_error", xr.DataArray(0.0)).astype(float)
     found["stated"] = np.nan_to_num(along(error))
     found["group"] = variable.name
-    for dim in (dim for dim in reading.dims if dim not in ("view", "wavelength")):
+    for dim in (str(x) for x in reading.dims if x not in ("view", "wavelength")):
         place = along(xr.DataArray(np.arange(reading.sizes[dim]), dims=dim))
         found["group"] += [f" {at}" for at in place]
     colored = found["wavelength"].nunique() > 1

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import inspect
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -105,8 +105,11 @@ def show(result: Any) -> DisplaySummary:
         CaptureError: A capture does not hold together.
         FitError: It is none of these.
     """
-    card = next((card for applies, card in VALUES if applies(result)), _result_card)
-    return card(result)
+    if _is_capture(result):
+        return _capture_card(result)
+    if isinstance(result, HTMLRepr):
+        return _value_card(result)
+    return prior_card(result) if _are_priors(result) else _result_card(result)
 
 
 def _result_card(result: Any) -> DisplaySummary:
@@ -181,11 +184,3 @@ def _described_card(result: xr.Dataset) -> DisplaySummary:
     return DisplaySummary(
         text.capture_name(provenance_of(result)), tuple(verdict(result).sentences), (table,)
     )
-
-
-VALUES: tuple[tuple[Callable[[Any], bool], Callable[[Any], DisplaySummary]], ...] = (
-    (_is_capture, _capture_card),
-    (lambda value: isinstance(value, HTMLRepr), _value_card),
-    (_are_priors, prior_card),
-)
-"""Cards of what is no result, in the order in which they are tried."""
