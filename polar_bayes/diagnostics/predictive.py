@@ -56,16 +56,6 @@ class PredictiveCheck:
     loo: Loo | None
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class PitBand:
-    """Empirical distribution of PIT values minus the uniform, with a simultaneous band."""
-
-    at: np.ndarray
-    difference: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-
-
 @once
 def predictive_checks(fit: FitView) -> dict[str, PredictiveCheck]:
     """Compare every recorded variable with its prediction."""
@@ -73,8 +63,12 @@ def predictive_checks(fit: FitView) -> dict[str, PredictiveCheck]:
     return {v.name: _check(v, relative_ess, correction) for v in flat_variables(fit)}
 
 
-def pit_band(pit: np.ndarray, most: int = 500) -> PitBand | None:
-    """Simultaneous band of the empirical distribution of PIT values; None for fewer than two."""
+def pit_band(pit: np.ndarray, most: int = 500) -> xr.Dataset | None:
+    """Empirical distribution of PIT values minus the uniform, with a simultaneous band.
+
+    Returns:
+        `difference`, and the band from `lower` to `upper`, over `at`; None for fewer than two.
+    """
     pit = pit[np.isfinite(pit)]
     if pit.size < 2:
         return None
@@ -83,7 +77,8 @@ def pit_band(pit: np.ndarray, most: int = 500) -> PitBand | None:
     at, lower, upper = _uniform_band(pit.size)
     ecdf = np.searchsorted(np.sort(pit), at, side="right") / pit.size
     ecdf[[0, -1]] = 0.0, 1.0
-    return PitBand(at=at, difference=ecdf - at, lower=lower - at, upper=upper - at)
+    curves = {"difference": ecdf, "lower": lower, "upper": upper}
+    return xr.Dataset({name: ("at", curve - at) for name, curve in curves.items()}, {"at": at})
 
 
 @functools.lru_cache(maxsize=64)
