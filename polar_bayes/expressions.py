@@ -17,9 +17,6 @@ from polar_bayes.errors import FitError, PolarBayesError, one_line
 Known = Mapping[str, Callable[..., object]]
 """What a text may name: classes and functions by their names."""
 
-MANY = 40
-"""As many names are too many for a message."""
-
 
 def parse_value(
     text: object, known: Known, where: str, error: type[PolarBayesError] = FitError
@@ -80,8 +77,8 @@ class _Parser:
             made = None if on_value else self.known.get(name)
         if made is None:
             near = difflib.get_close_matches(name, self.known, n=1) or [*self.known]
-            one, few = len(near) == 1, ", ".join(near) if len(near) < MANY else "those of NumPyro"
-            hint = f"did you mean {near[0]}?" if one else f"give one of {few}"
+            few = ", ".join(near) if len(near) < 40 else "those of NumPyro"  # too many to list
+            hint = f"did you mean {near[0]}?" if len(near) == 1 else f"give one of {few}"
             self._refuse(f"{ast.unparse(node.func)} is not known here", hint)
         arguments = [self._value(each) for each in node.args]
         if not all(part.arg for part in node.keywords):

@@ -17,6 +17,7 @@ not. Distributions are made of Python numbers, so that importing this file creat
 the fit chooses the precision.
 """
 
+import dataclasses
 import difflib
 import functools
 import math
@@ -290,12 +291,16 @@ class NormalCoordinate(dist.TransformedDistribution):
 
 def describe_prior(prior: dist.Distribution) -> str:
     """A prior as text, for reports: `TruncatedNormal(loc=1.45, scale=0.15, low=1.2, high=2)`."""
-    return _safely_described(prior, _Readable())
+    return prior_text(prior, is_exact=False)
 
 
-def prior_text(prior: dist.Distribution) -> str:
+def prior_text(prior: dist.Distribution, *, is_exact: bool = True) -> str:
     """A prior as text with every digit, which `parse_prior` reads."""
-    return _safely_described(prior, _Exact())
+    try:
+        return _Calls(is_exact).describe(prior)
+    except Exception:
+        # A report must not fail because of a user-defined distribution.
+        return type(prior).__name__
 
 
 def parse_prior(text: object, where: str) -> dist.Distribution:
@@ -328,118 +333,68 @@ def unwrapped(distribution: dist.Distribution) -> dist.Distribution:
     return distribution
 
 
-def _safely_described(prior: dist.Distribution, style: "_Readable") -> str:
-    try:
-        return style.describe(prior)
-    except Exception:
-        # A report must not fail because of a user-defined distribution.
-        return type(prior).__name__
-
-
 type Mixture = dist.MixtureSameFamily | dist.MixtureGeneral
 
+Truncated = (
+    dist.LeftTruncatedDistribution
+    | dist.RightTruncatedDistribution
+    | dist.TwoSidedTruncatedDistribution
+)
 
-class _Readable:
-    """Descriptions for readers."""
+
+@dataclasses.dataclass(frozen=True)
+class _Calls:
+    """Distributions as the calls that make them, which `parse_prior` reads if they are exact."""
+
+    is_exact: bool
 
     def describe(self, prior: dist.Distribution) -> str:
         """A distribution with its arguments."""
-        shape = (*prior.batch_shape, *prior.event_shape)
-        prior = unwrapped(prior)
-        copies = f" x {shape}" if shape != (*prior.batch_shape, *prior.event_shape) else ""
-        return f"{self._call(prior)}{copies}"
-
-    def number(self, number: float) -> str:
-        return f"{number:g}"
-
-    def text(self, numbers: np.ndarray) -> str:
-        """A number, a short list in brackets, a longer one by its shape."""
-        if numbers.size == 1:
-            return self.number(numbers.item())
-        if numbers.ndim == 1 and numbers.size <= 8:
-            return f"[{', '.join(map(self.number, numbers.tolist()))}]"
-        return f"<array {numbers.shape}>"
-
-    def _call(self, prior: dist.Distribution) -> str:
-        if isinstance(
-            prior,
-            dist.LeftTruncatedDistribution
-            | dist.RightTruncatedDistribution
-            | dist.TwoSidedTruncatedDistribution,
-        ):
-            return self.truncated(prior)
-        if isinstance(prior, dist.MixtureSameFamily | dist.MixtureGeneral):
-            return self.mixture(prior)
-        if isinstance(prior, dist.TransformedDistribution) and not prior.arg_constraints:
-            steps = [
-                f"{type(step).__name__}({self.fields(vars(step))})" for step in prior.transforms
-            ]
-            return f"{type(prior).__name__}({self.describe(prior.base_dist)}, {self.steps(steps)})"
-        return f"{type(prior).__name__}({self.arguments(prior)})"
-
-    def arguments(self, prior: dist.Distribution) -> str:
-        return self.fields({key: getattr(prior, key, None) for key in prior.arg_constraints})
-
-    def truncated(self, prior: dist.Distribution) -> str:
-        inner = f"{self.arguments(prior.base_dist)}, {self.bounds(prior)}"
-        return f"Truncated{type(prior.base_dist).__name__}({inner})"
-
-    def bounds(self, prior: dist.Distribution) -> str:
-        bounds = zip(("low", "high"), support_bounds(prior), strict=True)
-        return ", ".join(f"{key}={self.number(x)}" for key, x in bounds if math.isfinite(x))
-
-    def mixture(self, prior: Mixture) -> str:
-        weights = self.text(np.asarray(prior.mixing_distribution.probs))
-        return f"Mixture(weights={weights}, {', '.join(map(self.describe, _components(prior)))})"
-
-    def steps(self, steps: list[str]) -> str:
-        return ", ".join(steps)
-
-    def fields(self, values: Mapping[str, object]) -> str:
-        """The numeric values among these, as `loc=1, scale=2`."""
-        shown = {key: np.asarray(x) for key, x in values.items() if not key.startswith("_")}
-        numbers = {key: x for key, x in shown.items() if x.dtype.kind in "iuf"}
-        return ", ".join(f"{key}={self.text(number)}" for key, number in numbers.items())
-
-
-class _Exact(_Readable):
-    """Descriptions that `parse_prior` reads."""
-
-    @override
-    def describe(self, prior: dist.Distribution) -> str:
+        if isinstance(prior, dist.distribution.MaskedDistribution) and not self.is_exact:
+            return self.describe(prior.base_dist)
         if isinstance(prior, dist.Independent):
             return f"{self.describe(prior.base_dist)}.to_event({prior.reinterpreted_batch_ndims})"
         if isinstance(prior, dist.ExpandedDistribution):
             return f"{self.describe(prior.base_dist)}.expand({list(prior.batch_shape)})"
-        return self._call(prior)
+        if isinstance(prior, Truncated):
+            return self._truncated(prior)
+        name = type(prior).__name__
+        if isinstance(prior, dist.MixtureSameFamily | dist.MixtureGeneral):
+            weights = self._fields({"probs": prior.mixing_distribution.probs})
+            inner = ", ".join(map(self.describe, _components(prior)))
+            inner = f"[{inner}]" if isinstance(prior, dist.MixtureGeneral) else inner
+            return f"{name}(CategoricalProbs({weights}), {inner})"
+        if isinstance(prior, dist.TransformedDistribution) and not prior.arg_constraints:
+            steps = (f"{type(x).__name__}({self._fields(vars(x))})" for x in prior.transforms)
+            return f"{name}({self.describe(prior.base_dist)}, [{', '.join(steps)}])"
+        return f"{name}({self._arguments(prior)})"
 
-    @override
-    def number(self, number: float) -> str:
-        short = f"{number:g}"
-        return short if float(short) == number else repr(number)
+    def _arguments(self, prior: dist.Distribution) -> str:
+        return self._fields({key: getattr(prior, key, None) for key in prior.arg_constraints})
 
-    @override
-    def text(self, numbers: np.ndarray) -> str:
-        if numbers.ndim == 0:
-            return self.number(numbers.item())
-        return f"[{', '.join(map(self.text, numbers))}]"
+    def _truncated(self, prior: dist.Distribution) -> str:
+        ends = zip(("low", "high"), support_bounds(prior), strict=True)
+        bounds = self._fields({key: x for key, x in ends if math.isfinite(x)})
+        name = f"Truncated{type(prior.base_dist).__name__}"
+        if hasattr(dist, name):
+            return f"{name}({self._arguments(prior.base_dist)}, {bounds})"
+        return f"TruncatedDistribution({self.describe(prior.base_dist)}, {bounds})"
 
-    @override
-    def truncated(self, prior: dist.Distribution) -> str:
-        if hasattr(dist, f"Truncated{type(prior.base_dist).__name__}"):
-            return super().truncated(prior)
-        return f"TruncatedDistribution({self.describe(prior.base_dist)}, {self.bounds(prior)})"
+    def _fields(self, values: Mapping[str, object]) -> str:
+        """The numeric values among these, as `loc=1, scale=2`."""
+        shown = {key: np.asarray(x) for key, x in values.items() if not key.startswith("_")}
+        numbers = {key: x for key, x in shown.items() if x.dtype.kind in "iuf"}
+        return ", ".join(f"{key}={self._text(number)}" for key, number in numbers.items())
 
-    @override
-    def mixture(self, prior: Mixture) -> str:
-        weights = f"CategoricalProbs({self.fields({'probs': prior.mixing_distribution.probs})})"
-        inner = ", ".join(map(self.describe, _components(prior)))
-        several = isinstance(prior, dist.MixtureGeneral)
-        return f"{type(prior).__name__}({weights}, {f'[{inner}]' if several else inner})"
-
-    @override
-    def steps(self, steps: list[str]) -> str:
-        return f"[{', '.join(steps)}]"
+    def _text(self, numbers: np.ndarray) -> str:
+        """A number, or a list; for readers a long list by its shape."""
+        if numbers.ndim == 0 or (numbers.size == 1 and not self.is_exact):
+            number = numbers.item()
+            short = f"{number:g}"
+            return repr(number) if self.is_exact and float(short) != number else short
+        if not self.is_exact and (numbers.ndim > 1 or numbers.size > 8):
+            return f"<array {numbers.shape}>"
+        return f"[{', '.join(map(self._text, numbers))}]"
 
 
 def _components(prior: Mixture) -> Sequence[dist.Distribution]:
@@ -592,18 +547,19 @@ counts as by hand."""
 UNCHECKED_GAIN = dist.LogNormal(0.0, 0.3)
 """Prior of `channel_gain_ratio` where the incident levels of both channels were not read."""
 
-_INDICES = (
-    *("refractive_index", "refractive_index_location", "cauchy_a"),
-    *("refractive_index_level", "refractive_index_level_location"),
-    *("coat_refractive_index", "film_refractive_index"),
+INDICES = (
+    *("refractive_index", "cauchy_a", "refractive_index_level"),
+    *("refractive_index_location", "refractive_index_level_location"),
 )
+"""Parameters whose prior bounds the index of a material."""
+
 RANGES: dict[str, tuple[float, float]] = {
     **{
         name: support_bounds(prior)
         for name, prior in _ROWS.items()
         if isinstance(prior, dist.HalfNormal | dist.LogNormal | dist.Beta)
     },
-    **dict.fromkeys(_INDICES, (1.0, math.inf)),
+    **dict.fromkeys((*INDICES, "coat_refractive_index", "film_refractive_index"), (1.0, math.inf)),
     "anisotropy": (0.0, 0.9),
     "sellmeier_strength": (0.0, math.inf),
     "sellmeier_resonance": (0.0, 0.1),

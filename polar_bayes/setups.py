@@ -138,10 +138,6 @@ def find_setup(name: str | Setup) -> Setup:
     return SETUPS[name]
 
 
-CHANNELS: Mapping[str, float] = MappingProxyType({"s": 0.0, "p": 90.0})
-"""Angle of the analyzer before each channel, degree."""
-
-
 def as_read(setup: Setup, capture: xr.Dataset) -> Setup:
     """The set-up as a capture was read: at mirror angles, by one channel, by polarized light."""
     is_usual = any(setup.known == own.known for own in SETUPS.values())
@@ -186,7 +182,8 @@ def _by_polarized_light(setup: Setup, angle: float) -> Setup:
 
 def _of_one_channel(setup: Setup, capture: xr.Dataset) -> Setup:
     """The analyzer of a channel is part of the scene, its gain is part of the exposure."""
-    scene, angle = setup.scene, CHANNELS.get(str(capture["intensity"].attrs.get("channel")))
+    scene, channel = setup.scene, str(capture["intensity"].attrs.get("channel"))
+    angle = {"s": 0.0, "p": 90.0}.get(channel)
     scene = scene.without(ChannelGain) if scene.has(ChannelGain) else scene
     if angle is not None and not scene.has(Analyzer):
         scene = dataclasses.replace(scene, instrument=Instrument((*scene.terms, Analyzer(angle))))

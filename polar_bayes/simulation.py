@@ -156,10 +156,12 @@ class Protocol:
 
 # --- Validation of parameters and noise -----------------------------------------------------------
 
-_TERMS = (AngleZero, BeamOverlap, ChannelGain, DarkLevel, Discrepancy, DolpGain, Leakage)
-
 NEUTRAL: Mapping[str, np.ndarray] = {
-    **{name: np.asarray(x) for term in _TERMS for name, x in term.neutral.items()},
+    **{
+        name: np.asarray(x)
+        for term in (AngleZero, BeamOverlap, ChannelGain, DarkLevel, Discrepancy, DolpGain, Leakage)
+        for name, x in term.neutral.items()
+    },
     **dict.fromkeys(("normal_tilt_x", "normal_tilt_y"), np.asarray(0.0)),
     **dict.fromkeys((name for name in PRIORS if name.endswith("_offset")), np.asarray(0.0)),
     "discrepancy_weights": np.zeros(3),

@@ -226,23 +226,27 @@ SHIFTED = dist.TransformedDistribution(
         (PRIORS["refractive_index"], "TruncatedNormal(loc=1.45, scale=0.15, low=1.2, high=2)"),
         (dist.TruncatedNormal(1.45, 0.15, low=1.0), "TruncatedNormal(loc=1.45, scale=0.15, low=1)"),
         (dist.TruncatedCauchy(0.0, 1.0, high=2.0), "TruncatedCauchy(loc=0, scale=1, high=2)"),
-        (dist.Normal(0.0, 1.0).expand([4]).to_event(1), "Normal(loc=0, scale=1) x (4,)"),
-        (dist.Normal(0.0, 1.0).expand([3]), "Normal(loc=0, scale=1) x (3,)"),
+        (
+            dist.Normal(0.0, 1.0).expand([4]).to_event(1),
+            "Normal(loc=0, scale=1).expand([4]).to_event(1)",
+        ),
+        (dist.Normal(0.0, 1.0).expand([3]), "Normal(loc=0, scale=1).expand([3])"),
         (dist.Normal(0.0, 1.0).mask(False), "Normal(loc=0, scale=1)"),
         (dist.LogNormal(jnp.array([0.0, 1.0]), 0.5), "LogNormal(loc=[0, 1], scale=0.5)"),
         (dist.LogNormal(jnp.zeros((3, 1)), 0.5), "LogNormal(loc=<array (3, 1)>, scale=0.5)"),
         (
             dist.MixtureSameFamily(WEIGHTS, dist.Normal(jnp.array([1.4, 1.6]), 0.1)),
-            "Mixture(weights=[0.25, 0.75], Normal(loc=[1.4, 1.6], scale=0.1))",
+            "MixtureSameFamily(CategoricalProbs(probs=[0.25, 0.75]), "
+            "Normal(loc=[1.4, 1.6], scale=0.1))",
         ),
         (
             dist.MixtureGeneral(WEIGHTS, [dist.Gamma(2.0, 3.0), dist.LogNormal(0.0, 1.0)]),
-            "Mixture(weights=[0.25, 0.75], Gamma(concentration=2, rate=3), "
-            "LogNormal(loc=0, scale=1))",
+            "MixtureGeneral(CategoricalProbs(probs=[0.25, 0.75]), [Gamma(concentration=2, rate=3), "
+            "LogNormal(loc=0, scale=1)])",
         ),
         (
             SHIFTED,
-            "TransformedDistribution(HalfNormal(scale=0.5), AffineTransform(loc=1, scale=2))",
+            "TransformedDistribution(HalfNormal(scale=0.5), [AffineTransform(loc=1, scale=2)])",
         ),
         (dist.ImproperUniform(dist.constraints.positive, (), ()), "ImproperUniform()"),
     ],

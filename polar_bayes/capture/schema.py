@@ -163,6 +163,14 @@ def as_numbers(values: object) -> np.ndarray:
         return np.asarray(np.nan)
 
 
+def check_choice(value: object, among: Iterable[str | None], where: str) -> None:
+    """Refuse an option that is none of these; None among them stands for one left out."""
+    if value not in (choices := list(among)):
+        names = list(filter(None, choices))
+        hint = f"give {' or '.join(names)}" if len(names) < 3 else f"give one of {', '.join(names)}"
+        raise CaptureError(f"it is {value!r}", where=where, hint=hint)
+
+
 def nearest_name(name: object, known: Sequence[str]) -> str | None:
     """The known name most similar to this one; None where it is known, or names a truth."""
     if name in known or (isinstance(name, str) and TRUTH.fullmatch(name)):
@@ -277,9 +285,8 @@ def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
     _check_polarization(numbers, layout, valid, source)
     _check_intensity_units(numbers, source)
     # By a rotary stage, by hand, or through a lens.
-    if dataset.attrs.get("angle_set_by", "hand") not in ("stage", "hand", "lens"):
-        what, hint = "no such way to set an angle", "give one of stage, hand, lens"
-        raise CaptureError(what, where=f"{source}: attribute angle_set_by", hint=hint)
+    set_by = dataset.attrs.get("angle_set_by", "hand")
+    check_choice(set_by, ("stage", "hand", "lens"), f"{source}: attribute angle_set_by")
     names = [str(name) for name in dataset.variables if TRUTH.fullmatch(str(name))]
     truths = {name: _truth(dataset.variables[name], name, layout, source) for name in names}
     labels, attributes = _labels(dataset, layout, source), clean_attributes(dataset.attrs, source)

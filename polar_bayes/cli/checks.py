@@ -30,20 +30,6 @@ from polar_bayes.progress import stages
 if TYPE_CHECKING:
     from polar_bayes.results import Result
 
-CALIBRATION_COLUMNS = (
-    "answered, failed: fits with an answer, and without one",
-    "p_value: of uniform ranks; small where the method is wrong",
-    "held_50, held_80, held_95: share of intervals that hold the truth; a failed fit is a miss",
-    "crps: mean distance of the posterior from the truth, in the unit of the parameter",
-)
-NEXT_STEPS = {
-    True: "Next: polar-bayes {verb} {capture} with the same --method, --scene, --model and "
-    "--prior; its 95% intervals may be quoted as such. polar-bayes report {out} --out report "
-    "draws the ranks.",
-    False: "Next: polar-bayes report {out} --out report shows where the ranks fail; try another "
-    "--method first (nuts is the slowest and the surest), then the model.",
-}
-
 
 @command()
 @capture_argument
@@ -86,13 +72,29 @@ def calibrate(
         print_json({**rows, "verdict": verdict.sentences})
     else:
         columns = ["answered", "failed", "p_value", "held_50", "held_80", "held_95", "crps"]
-        print_frame(table[columns], CALIBRATION_COLUMNS)
+        told = (
+            "answered, failed: fits with an answer, and without one",
+            "p_value: of uniform ranks; small where the method is wrong",
+            "held_50, held_80, held_95: share of intervals that hold the truth; a failed fit is a "
+            "miss",
+            "crps: mean distance of the posterior from the truth, in the unit of the parameter",
+        )
+        print_frame(table[columns], told)
         if "readings" in tables:
             click.echo()
             print_frame(tables["readings"].drop(columns=["reading", "test"]))
         method = METHODS.get(provenance_of(calibration)["method"])
         verb = "map" if method is not None and not method.fits_one else "fit"
-        next_step = NEXT_STEPS[verdict.passed].format(verb=verb, capture=capture, out=out)
+        next_step = (
+            f"Next: polar-bayes report {out} --out report shows where the ranks fail; try another "
+            "--method first (nuts is the slowest and the surest), then the model."
+        )
+        if verdict.passed:
+            next_step = (
+                f"Next: polar-bayes {verb} {capture} with the same --method, --scene, --model and "
+                "--prior; its 95% intervals may be quoted as such. polar-bayes report "
+                f"{out} --out report draws the ranks."
+            )
         say("\n".join(["", *verdict.sentences, "", next_step]))
     return 0 if verdict.passed else NOT_CONVERGED
 
@@ -185,19 +187,16 @@ def accuracy(
     """What each method gets wrong for this capture, and what it costs in time."""
     data, settings = pb.load_capture(capture), read_scene_options(settings)
     names = methods or tuple(pb.methods.STUDY_METHODS)
-    settings["methods"] = {name: pb.methods.STUDY_METHODS[name] for name in names}
-    quick = {
-        name: pb.methods.STUDY_METHODS[name]
-        for name in ("point", "laplace", "importance")
-        if name in names
-    }
+    shown = ["error", "worst", "pareto_k", "r_hat", "seconds_first", "seconds_again"]
+    settings["methods"] = chosen = {name: pb.methods.STUDY_METHODS[name] for name in names}
+    quick = {name: chosen[name] for name in ("point", "laplace", "importance") if name in chosen}
     if quick and not as_json:
         click.echo("First answer, by a rough reference:\n")
         rough = pb.benchmark.Reference(error=0.06, longer=0)
         first = {"methods": quick, "overrides": (), "reference": rough, "fresh": False}
         study = pb.accuracy(data, **settings | first)
         pb.save(study, out)
-        print_frame(pb.summary(study)[SHOWN], pb.benchmark.accuracy_sentences(study, tolerance))
+        print_frame(pb.summary(study)[shown], pb.benchmark.accuracy_sentences(study, tolerance))
         click.echo(f"\nIt is refined now, which takes minutes; {out} holds what is known so far.")
     if no_overrides:
         settings["overrides"] = ()
@@ -218,16 +217,13 @@ def accuracy(
         return
     click.echo()
     next_step = f"Next: polar-bayes fit {capture} --method NAME --out fit.nc, by the method named."
-    print_frame(table[SHOWN], [*ACCURACY_COLUMNS, "", advice, "", next_step])
-
-
-SHOWN = ["error", "worst", "pareto_k", "r_hat", "seconds_first", "seconds_again"]
-ACCURACY_COLUMNS = (
-    "error: largest error of a posterior mean or sd, in posterior sds of the reference",
-    "worst: the parameter that has it",
-    "pareto_k, r_hat: what the method says of itself; at most 0.7 and 1.01 are good",
-    "seconds_first, seconds_again: of the first fit, compilation included, and of the next",
-)
+    told = (
+        "error: largest error of a posterior mean or sd, in posterior sds of the reference",
+        "worst: the parameter that has it",
+        "pareto_k, r_hat: what the method says of itself; at most 0.7 and 1.01 are good",
+        "seconds_first, seconds_again: of the first fit, compilation included, and of the next",
+    )
+    print_frame(table[shown], [*told, "", advice, "", next_step])
 
 
 COMMANDS = (budget, calibrate, identify, accuracy)

@@ -26,69 +26,84 @@ def _flag(param: Param) -> str:
     return param.opts[0] if param is not None else "value"
 
 
+@dataclasses.dataclass(frozen=True)
 class Name(click.ParamType):
-    """A key of a registry of the package, which is not imported for this check."""
+    """A key of a registry of the package, which is not imported for this check.
 
+    One that `takes_calls` also takes settings such as `Nuts(draws=2000)`, which are parsed when
+    they are needed.
+    """
+
+    kind: str
+    names: tuple[str, ...]
+    error: type[PolarBayesError] = FitError
+    takes_calls: bool = False
     name = "text"
-
-    def __init__(self, kind: str, names: tuple[str, ...], error: type[PolarBayesError]) -> None:
-        self.kind, self.names, self.error = kind, names, error
 
     @override
     def convert(self, value: str | Path, param: Param, ctx: Context) -> str:
-        if value not in self.names:
+        if value not in self.names and not (self.takes_calls and "(" in str(value)):
             where, hint = f"{_flag(param)} {value}", f"give one of {', '.join(self.names)}"
             raise self.error(f"no such {self.kind}", where=where, hint=hint)
         return str(value)
 
 
-class Settings(Name):
-    """The same, or settings such as `Nuts(draws=2000)`, which are parsed when they are needed."""
-
-    @override
-    def convert(self, value: str | Path, param: Param, ctx: Context) -> str:
-        return str(value) if "(" in str(value) else super().convert(value, param, ctx)
-
-
+@dataclasses.dataclass(frozen=True)
 class Assignment(click.ParamType):
     """NAME=CALL, such as `angle_zero=Normal(0,3)`; the name may be left out where one is enough."""
 
+    is_named: bool
+    is_number: bool = False
     name = "text"
 
-    def __init__(self, *, is_named: bool) -> None:
-        self.is_named = is_named
-
     @override
-    def convert(self, value: str | Path, param: Param, ctx: Context) -> tuple[str, str]:
+    def convert(self, value: str | Path, param: Param, ctx: Context) -> tuple[str, str | float]:
+        where = f"{_flag(param)} {value}"
         name, equals, text = str(value).partition("=")
-        if equals and name.strip().isidentifier():
-            return name.strip(), text
-        if self.is_named:
-            what = "it does not say of what"
-            hint = "write NAME=DISTRIBUTION, such as 'angle_zero=Normal(0,3)'"
-            raise FitError(what, where=f"{_flag(param)} {value}", hint=hint)
-        return "", str(value)
+        if not (equals and name.strip().isidentifier()):
+            if self.is_named:
+                hint = "write NAME=DISTRIBUTION, such as 'angle_zero=Normal(0,3)'"
+                raise FitError("it does not say of what", where=where, hint=hint)
+            return "", str(value)
+        try:
+            return name.strip(), float(text) if self.is_number else text
+        except ValueError as error:
+            hint = "write it as --known light_zenith=0.2"
+            raise FitError("it is no number", where=where, hint=hint) from error
 
 
-MODEL = Name("model", ("per_material", "hierarchical", "gp_spectral"), FitError)
+MODEL = Name("model", ("per_material", "hierarchical", "gp_spectral"))
 MATERIAL = Name("material", ("leaf", "fruit", "plastic", "coating", "glass", "water"), CaptureError)
-FIT_METHOD = Settings("method", method_names(one=True), FitError)
-MANY_METHOD = Settings("method", method_names(many=True), FitError)
-STUDIED = tuple(name for name in method_names(one=True) if name != "auto")
-STUDY_METHOD = Name("method", (*STUDIED, "nuts short", "nuts long"), FitError)
+FIT_METHOD = Name("method", method_names(one=True), takes_calls=True)
+MANY_METHOD = Name("method", method_names(many=True), takes_calls=True)
+STUDY_METHOD = Name(
+    "method", (*(n for n in method_names(one=True) if n != "auto"), "nuts short", "nuts long")
+)
 
 
+@dataclasses.dataclass(frozen=True)
 class Input(click.ParamType):
-    """Path of a file or folder that is read; `check` refuses one that does not exist."""
+    """Path of a file or folder that is read; `check` refuses one that does not exist.
 
+    Where a scene is asked for, the `names` that the package knows may stand in its place, and a
+    path has the suffix of what is described `otherwise`.
+    """
+
+    is_path: bool = True
+    names: tuple[str, ...] = ()
+    suffix: str = ""
+    otherwise: str = ""
     name = "path"
-
-    def __init__(self, *, is_path: bool = True) -> None:
-        self.is_path = is_path
 
     @override
     def convert(self, value: str | Path, param: Param, ctx: Context) -> Path | str:
-        return as_path(value, _flag(param)) if self.is_path else str(value)
+        if value in self.names or not self.is_path:
+            return str(value)
+        path = as_path(value, _flag(param))
+        if not self.names or path.suffix == self.suffix or path.exists():
+            return path
+        hint = f"give one of {', '.join(self.names)}, or {self.otherwise}"
+        raise SceneError("no such scene", where=f"{_flag(param)} {value}", hint=hint)
 
     def check(self, path: Path) -> None:
         """Refuse a path that does not exist, unless it may be the name of a column."""
@@ -97,33 +112,14 @@ class Input(click.ParamType):
             raise CaptureError(f"there is no such {what}", where=str(path), hint="check the path")
 
 
-class NamedInput(Input):
-    """A name that the package knows, or the path of a file that is read in its place."""
-
-    def __init__(self, names: tuple[str, ...], suffix: str, otherwise: str) -> None:
-        super().__init__()
-        self.names, self.suffix, self.otherwise = names, suffix, otherwise
-
-    @override
-    def convert(self, value: str | Path, param: Param, ctx: Context) -> Path | str:
-        if value in self.names:
-            return str(value)
-        path = as_path(value, _flag(param))
-        if path.suffix == self.suffix or path.exists():
-            return path
-        hint = f"give one of {', '.join(self.names)}, or {self.otherwise}"
-        raise SceneError("no such scene", where=f"{_flag(param)} {value}", hint=hint)
-
-
+@dataclasses.dataclass(frozen=True)
 class Output(click.ParamType):
     """Path of an output; it is checked when all inputs are known."""
 
     # A folder or store has no `kind`; the function that writes it checks the rest.
 
+    kind: str | None = None
     name = "path"
-
-    def __init__(self, kind: str | None = None) -> None:
-        self.kind = kind
 
     @override
     def convert(self, value: str | Path, param: Param, ctx: Context) -> Path:
@@ -141,12 +137,12 @@ class Output(click.ParamType):
 
 
 INPUT, COLUMN_OR_INPUT = Input(), Input(is_path=False)
-CAPTURE_FILE, RESULT_FILE, FOLDER, STORE = Output("capture"), Output("result"), Output(), Output()
-SCENE_FILE = Output("scene")
+CAPTURE_FILE, RESULT_FILE, SCENE_FILE = map(Output, ("capture", "result", "scene"))
+FOLDER = STORE = Output()
 SETUP_NAMES = ("paper", "polarimeter", "camera", "picture", "goniometer")
-SCENE = NamedInput(SETUP_NAMES, ".toml", "a scene file (.toml)")
-FIT_SCENE = NamedInput((*SETUP_NAMES, "auto"), ".toml", "a scene file (.toml)")
-SCENE_SOURCE = NamedInput(SETUP_NAMES, ".nc", "a result")
+SCENE = Input(names=SETUP_NAMES, suffix=".toml", otherwise="a scene file (.toml)")
+FIT_SCENE = dataclasses.replace(SCENE, names=(*SETUP_NAMES, "auto"))
+SCENE_SOURCE = Input(names=SETUP_NAMES, suffix=".nc", otherwise="a result")
 
 
 class Command(click.Command):
@@ -170,7 +166,7 @@ class Command(click.Command):
 
 def _paths(value: object, kind: Input) -> Iterator[Path]:
     """Every path in the value of an option that may be given several times."""
-    if isinstance(value, Path) or (isinstance(value, str) and not isinstance(kind, NamedInput)):
+    if isinstance(value, Path) or (isinstance(value, str) and not kind.names):
         yield Path(value)
     elif isinstance(value, tuple):
         for item in value:
@@ -195,23 +191,9 @@ link_option = option(
 )  # fmt: skip
 
 
-def _standard_uncertainties(
-    ctx: Context, param: Param, value: tuple[tuple[str, str], ...]
-) -> dict[str, float]:
-    """NAME=NUMBER, given several times, as a mapping."""
-    found = {}
-    for name, text in value:
-        try:
-            found[name] = float(text)
-        except ValueError as error:
-            where, hint = f"{_flag(param)} {name}={text}", "write it as --known light_zenith=0.2"
-            raise FitError("it is no number", where=where, hint=hint) from error
-    return found
-
-
 known_option = option(
-    "--known", type=Assignment(is_named=True), multiple=True, metavar="NAME=UNCERTAINTY",
-    callback=_standard_uncertainties,
+    "--known", type=Assignment(is_named=True, is_number=True), multiple=True,
+    metavar="NAME=UNCERTAINTY", callback=lambda ctx, param, value: dict(value),
     help="What an input quantity is known to, such as --known light_zenith=0.2; once for each.",
 )  # fmt: skip
 view_limit_option = option(
@@ -231,19 +213,15 @@ scene_options = all_of(scene_option, prior_option, link_option, view_limit_optio
 
 
 NUTS_OPTIONS = {
-    "warmup": (int, "Draws that adapt the sampler, per chain."),
-    "most_draws": (int, "Draws kept at most, per chain."),
-    "target_acceptance": (float, "Higher means smaller steps."),
-    "max_tree_depth": (int, "A trajectory has at most 2 to this power steps."),
-}
-
-
-nuts_options = all_of(
-    *(
-        option(f"--{name.replace('_', '-')}", type=kind, help=f"{words} Of --method nuts.")
-        for name, (kind, words) in NUTS_OPTIONS.items()
+    name: option(f"--{name.replace('_', '-')}", type=kind, help=f"{words} Of --method nuts.")
+    for name, kind, words in (
+        ("warmup", int, "Draws that adapt the sampler, per chain."),
+        ("most_draws", int, "Draws kept at most, per chain."),
+        ("target_acceptance", float, "Higher means smaller steps."),
+        ("max_tree_depth", int, "A trajectory has at most 2 to this power steps."),
     )
-)
+}
+nuts_options = all_of(*NUTS_OPTIONS.values())
 """What messages recommend where chains have not converged."""
 
 

@@ -16,37 +16,29 @@ import click
 from polar_bayes.cli.options import NUTS_OPTIONS
 
 FUNCTIONS = {
-    "accuracy": "accuracy",
-    "calibrate": "calibrate",
+    **{name: name for name in ("accuracy", "calibrate", "fit", "identify", "report", "simulate")},
     "capture.combine": "combine",
     "choose_effects": "effects",
     "compare_fits": "compare",
     "compare_scenes": "scenes",
-    "fit": "fit",
     "fit_pixels": "map",
-    "identify": "identify",
     "maps.count_pixels": "report",
     "next_views": "identify",
     "profile": "identify",
     "region_means": "regions",
-    "report": "report",
-    "simulate": "simulate",
 }
 """Functions, and the command that calls each."""
 
 KEYWORDS = {
-    **{name: f"--{name}" for name in ("angle", "dim", "drop", "keep", "method", "model", "p")},
-    **{name: f"--{name}" for name in ("precision", "preset", "s", "scene", "scheduler", "seed")},
-    **{name: f"--{name}" for name in ("setup", "sheet", "table", "transfer", "truth")},
-    "angle_is": "--angle-is",
-    "aolp_from": "--aolp-from",
-    "color": "--color",
-    "saturation_level": "--saturation-level",
-    "delta": "--delta",
-    "mueller": "--mueller",
-    "psi": "--psi",
-    "unit": "--unit",
-    "wavelength": "--wavelength",
+    **{
+        name: f"--{name.replace('_', '-')}"
+        for name in (
+            *("angle", "angle_is", "aolp_from", "color", "delta", "dim", "drop", "keep", "method"),
+            *("model", "mueller", "p", "precision", "preset", "psi", "s", "saturation_level"),
+            *("scene", "scheduler", "seed", "setup", "sheet", "table", "transfer", "truth"),
+            *("unit", "wavelength"),
+        )
+    },
     "links": "--link",
     "parameter": "--profile",
     "priors": "--prior",

@@ -16,7 +16,6 @@ Kallioinen et al. (2024), Statistics and Computing 34, 57 (power scaling).
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -32,9 +31,6 @@ from polar_bayes.errors import FitError
 from polar_bayes.frames import PrintedFrame
 from polar_bayes.physics.part import notation
 from polar_bayes.setups import check_uncertainty
-
-OWN = ("noise", "prior")
-"""What contributes beside the set-up."""
 
 
 def budget(
@@ -66,7 +62,10 @@ def budget(
         )
     errors, stated = _errors(fit), _stated(fit)
     asked = _asked(stated, known or {})
-    densities = _densities(fit, {each.name for each in errors.values()})
+    # Of the readings, and of all priors but those of the input quantities.
+    names = {each.name for each in errors.values()}
+    likelihood = total_density(fit.result, "log_likelihood")
+    densities = [likelihood, total_density(fit.result, "log_prior", names)]
     rows = {}
     for scalar in fit.scalars:
         if scalar.is_material:
@@ -74,7 +73,7 @@ def budget(
                 joint = _covariance(scalar, errors)
                 noise = _share_of_noise(scalar, densities)
                 rows[scalar.label] = _row(joint, noise, stated, asked)
-    columns = ["sd", "perfect", *OWN, *stated.index]
+    columns = ["sd", "perfect", "noise", "prior", *stated.index]
     table = PrintedFrame.from_dict(rows, orient="index", columns=columns)
     table.attrs["known"] = asked.to_dict()
     return table
@@ -142,12 +141,6 @@ def _asked(stated: pd.Series, known: Mapping[str, float]) -> pd.Series:
     return pd.Series({**stated.to_dict(), **known}, dtype=float)
 
 
-def _densities(fit: FitView, errors: set[str]) -> list[np.ndarray | None]:
-    """Log densities of the readings, and of all priors but those of the input quantities."""
-    likelihood = total_density(fit.result, "log_likelihood")
-    return [likelihood, total_density(fit.result, "log_prior", errors)]
-
-
 def _share_of_noise(scalar: Scalar, densities: list[np.ndarray | None]) -> float:
     """Of the variance that no input quantity explains, the share of noise; the rest is prior."""
     # Raising a density to a power a divides its part of the precision by a: the variance then
@@ -161,17 +154,8 @@ def _share_of_noise(scalar: Scalar, densities: list[np.ndarray | None]) -> float
     return rates[0] / sum(rates) if sum(rates) > 0.0 else np.nan
 
 
-class BetterKnown(NamedTuple):
-    """The quantity that narrows a parameter most if it is known twice as well, and by how much."""
-
-    meaning: str
-    known: str
-    half: str
-    sd: float
-
-
-def better_known(fit: FitView, label: str) -> BetterKnown:
-    """What to know better for the sake of a parameter."""
+def better_known(fit: FitView, label: str) -> tuple[str, float]:
+    """What narrows a parameter most if it is known twice as well, in words; its sd by then."""
     errors, stated = _errors(fit), _stated(fit)
     joint = _covariance(next(each for each in fit.scalars if each.label == label), errors)
     half = 0.5 * stated
@@ -182,7 +166,7 @@ def better_known(fit: FitView, label: str) -> BetterKnown:
     name = min(variances, key=variances.__getitem__)
     meaning, known = described(fit, name, stated[name])
     _, better = described(fit, name, half[name])
-    return BetterKnown(meaning, known, better, math.sqrt(variances[name]))
+    return f"{meaning} known to {better} instead of {known}", math.sqrt(variances[name])
 
 
 def described(fit: FitView, quantity: str, u: float) -> tuple[str, str]:
@@ -208,10 +192,9 @@ def budget_sentences(fit: FitView) -> tuple[str, ...]:
     if wider.empty:
         return ()
     worst = str(wider.index[0])
-    better, now = better_known(fit, worst), budget(fit).loc[worst, "sd"]
+    (what, sd), now = better_known(fit, worst), budget(fit).loc[worst, "sd"]
     factors = join([f"{label} {factor:.2g} times" for label, factor in wider.items()])
     return (
         "What the set-up is known to makes standard uncertainties larger than those of a perfect "
-        f"one: {factors}. That of {worst} would be {better.sd:.2g} instead of {now:.2g} with the "
-        f"{better.meaning} known to {better.half} instead of {better.known}.",
+        f"one: {factors}. That of {worst} would be {sd:.2g} instead of {now:.2g} with the {what}.",
     )

@@ -96,7 +96,8 @@ def verdict(fit: FitView) -> Verdict:
         *_mode_cautions(provenance),
         *_tail_cautions(fit),
         *_estimate_cautions(fit),
-        *_reading_cautions(provenance.get("counts", {})),
+        *_masked(provenance.get("counts", {})),
+        *_edges(provenance.get("counts", {}), many=True),
         *setup_cautions(provenance),
         *provenance.get("capture_cautions", ()),
         *against.get("caution", []),
@@ -106,7 +107,7 @@ def verdict(fit: FitView) -> Verdict:
     notes = (
         *against.get("note", []),
         *_chain_notes(fit),
-        *_reading_notes(provenance.get("counts", {})),
+        *_edges(provenance.get("counts", {}), many=False),
         *budget_sentences(fit),
     )
     made, missing = checks_made(method, criticism)
@@ -146,11 +147,9 @@ def json_summary(result: xr.DataTree | FitView) -> dict[str, Any]:
         },
         "converged": found.converged,
         "passed": found.passed,
-        "problems": list(found.problems),
-        "cautions": list(found.cautions),
+        **{key: list(getattr(found, key)) for key in ("problems", "cautions")},
         "notes": list(found.findings),
-        "checked": list(found.checked),
-        "not_checked": list(found.not_checked),
+        **{key: list(getattr(found, key)) for key in ("checked", "not_checked")},
         "criticism": {
             str(check): {"level": row["level"], "p_value": _number(row["p_value"])}
             for check, row in criticize(fit).iterrows()
@@ -213,8 +212,7 @@ def _point_rows(fit: FitView) -> np.ndarray:
     stated = dict(with_entries(fit.scalars, fit.provenance.get("standard_errors", {})))
     rows = np.full((len(fit.scalars), len(COLUMNS)), np.nan)
     for row, scalar in zip(rows, fit.scalars, strict=True):
-        error = stated.get(scalar)
-        row[:2] = scalar.draws.mean(), math.nan if error is None else error
+        row[:2] = scalar.draws.mean(), stated.get(scalar)  # None becomes NaN
     return rows
 
 
@@ -402,29 +400,25 @@ def _estimate_cautions(fit: FitView) -> Iterator[str]:
         )
 
 
-def _reading_cautions(counts: Provenance) -> Iterator[str]:
+def _masked(counts: Provenance) -> Iterator[str]:
     total, masked = counts.get("views") or 0, counts.get("masked") or 0
     if total and masked / total > LIMITS.masked:
         yield (
             f"{masked} of {total} readings are marked valid=False: the rest may not be a fair "
             "sample of the angles."
         )
-    for name, count in (counts.get("at_margin") or {}).items():
-        if total and count / total > LIMITS.at_margin:
-            yield (
-                f"{count} readings of {name} lie at the edge of their range and were moved to "
-                "the link's margin: their noise is not what the link describes."
-            )
 
 
-def _reading_notes(counts: Provenance) -> Iterator[str]:
-    """Readings at the edge of their range, as a mirror has near Brewster's angle, where few."""
+def _edges(counts: Provenance, *, many: bool) -> Iterator[str]:
+    """Readings at the edge of their range, as a mirror has near Brewster's angle: few or many."""
     total = counts.get("views") or 0
+    of = "" if many else f" of {total}"
+    effect = ": their noise is not what the link describes" if many else ""
     for name, count in (counts.get("at_margin") or {}).items():
-        if count and total and count / total <= LIMITS.at_margin:
+        if count and total and many == (count / total > LIMITS.at_margin):
             yield (
-                f"{count} of {total} readings of {name} lie at the edge of their range and were "
-                "moved to the link's margin."
+                f"{count}{of} readings of {name} lie at the edge of their range and were moved to "
+                f"the link's margin{effect}."
             )
 
 

@@ -42,13 +42,9 @@ from polar_bayes.inference.result import CENTRAL_95, bounds_of
 from polar_bayes.observation.data import ANGLES
 from polar_bayes.observation.links import PERFECT
 from polar_bayes.physics.part import absence
+from polar_bayes.priors import INDICES
 
 INDEX = "refractive_index"
-INDEX_PARAMETERS = (
-    *(INDEX, "cauchy_a", "refractive_index_level"),
-    *("refractive_index_location", "refractive_index_level_location"),
-)
-"""Parameters whose prior bounds the index of a material."""
 QUESTIONS = {
     "priors": "are the material and what carries it in the tails of their priors?",
     "absent": "is a part of the scene, or a fault of the instrument, not seen at all?",
@@ -285,21 +281,16 @@ def _bounds(fit: FitView, is_beyond: bool) -> Finding:
         return Finding("passed")
     hits.sort(key=lambda hit: -hit[0])
     where = [f"{s.label} at {bound:g} ({share:.0%} of its draws)" for share, s, bound in hits]
-    beyond = "" if is_beyond else _beyond(hits[0][1], hits[0][2])
+    (_, scalar, bound), beyond = hits[0], ""
+    if scalar.name == INDEX and bound > 1.0 and not is_beyond:
+        wider = f"TruncatedNormal({bound:g}, 0.3, low=1)"
+        beyond = f" If the index may lie beyond, give priors={{'{INDEX}': {wider}}}."
     sentence = (
         f"The posterior lies against a bound: {listed(where)}; what is beyond is excluded by the "
         "prior or by physics, not by the readings, so the interval is too narrow or the scene is "
         f"wrong.{beyond}"
     )
     return Finding("caution", statistic=hits[0][0], sentence=sentence)
-
-
-def _beyond(scalar: Scalar, bound: float) -> str:
-    """The prior that reaches beyond a bound of the index, as the call that makes it."""
-    if scalar.name != INDEX or not bound > 1.0:
-        return ""
-    prior = f"TruncatedNormal({bound:g}, 0.3, low=1)"
-    return f" If the index may lie beyond, give priors={{'{INDEX}': {prior}}}."
 
 
 def _index(fit: FitView) -> Finding:
@@ -309,7 +300,7 @@ def _index(fit: FitView) -> Finding:
     by_eye: dict[str, IndexByEye | None] = {n: IndexByEye(*index) for n, index in stated.items()}
     free = {s.name for s in fit.scalars} & set(provenance.get("bounds") or {})
     free -= set(provenance.get("fixed") or {})
-    parameter = next((name for name in INDEX_PARAMETERS if name in free), "")
+    parameter = next((name for name in INDICES if name in free), "")
     bounds = bounds_of(provenance, parameter)
     sentences = index_sentences(by_eye, bounds, parameter, "the prior")
     if not parameter or not sentences:
@@ -461,9 +452,11 @@ def _alternatives(fit: FitView, absent: Sequence[Scalar]) -> Finding:
     p_value = math.exp(min(0.0, math.log(factors.size) - float(logsumexp(factors))))
     moves = table["moves"][table["alternative"] == alternative]
     if level(p_value) != "passed":
+        large = highest > math.log(1e4)
+        times = f"10^{highest / math.log(10.0):.0f}" if large else f"{math.exp(highest):.3g}"
         sentence = (
             f"Another part explains the readings better: {_swap_text(alternative, part)} ({path}), "
-            f"by a Bayes factor of {_factor_text(highest)}; fit the scene that has it."
+            f"by a Bayes factor of {times}; fit the scene that has it."
         )
         # What a smooth error has stood in for without harm to the answer only widens it.
         stands_in = part == NOTHING and not moves.any()
@@ -503,8 +496,3 @@ def _without_idle(table: pd.DataFrame, absent: Sequence[Scalar]) -> pd.DataFrame
     idle = {a.part for s in absent if (a := absence(s.name)) is not None and a.part}
     moved = table.groupby(["path", "alternative"])["moves"].transform("any")
     return table[~table["path"].str.split(".").str[0].isin(idle) | moved]
-
-
-def _factor_text(log_factor: float) -> str:
-    large = log_factor > math.log(1e4)
-    return f"10^{log_factor / math.log(10.0):.0f}" if large else f"{math.exp(log_factor):.3g}"

@@ -55,17 +55,14 @@ class Population:
 
     def to_scale(self, value: np.ndarray) -> np.ndarray:
         """From the unit of the parameter to the scale on which the population is normal."""
-        value = np.asarray(value, float)
+        scales = {"log": np.log, "log odds": scipy.special.logit, "plain": np.asarray}
         with np.errstate(divide="ignore", invalid="ignore"):
-            if self.scale == "log":
-                return np.log(value)
-            return scipy.special.logit(value) if self.scale == "log odds" else value
+            return scales[self.scale](np.asarray(value, float))
 
     def from_scale(self, value: np.ndarray) -> np.ndarray:
         """Back to the unit of the parameter."""
-        if self.scale == "log":
-            return np.exp(value)
-        return scipy.special.expit(value) if self.scale == "log odds" else np.asarray(value)
+        scales = {"log": np.exp, "log odds": scipy.special.expit, "plain": np.asarray}
+        return scales[self.scale](value)
 
     def differences(self) -> np.ndarray:
         """Draws of the spread in the unit of the parameter; a factor on the log scale."""

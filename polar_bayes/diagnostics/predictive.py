@@ -25,8 +25,6 @@ from polar_bayes.diagnostics.view import FitView, once
 from polar_bayes.numerics.psis import MAX_PARETO_K, smooth
 
 PROBABILITIES = (0.5, 0.8, 0.95)
-COMPARABLE = MappingProxyType({"valid": True, "saturated": False})
-"""Flags of readings that can be compared with a prediction."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -58,16 +56,6 @@ class PredictiveCheck:
     loo: Loo | None
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class PitBand:
-    """Empirical distribution of PIT values minus the uniform, with a simultaneous band."""
-
-    at: np.ndarray
-    difference: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-
-
 @once
 def predictive_checks(fit: FitView) -> dict[str, PredictiveCheck]:
     """Compare every recorded variable with its prediction."""
@@ -75,8 +63,12 @@ def predictive_checks(fit: FitView) -> dict[str, PredictiveCheck]:
     return {v.name: _check(v, relative_ess, correction) for v in flat_variables(fit)}
 
 
-def pit_band(pit: np.ndarray, most: int = 500) -> PitBand | None:
-    """Simultaneous band of the empirical distribution of PIT values; None for fewer than two."""
+def pit_band(pit: np.ndarray, most: int = 500) -> xr.Dataset | None:
+    """Empirical distribution of PIT values minus the uniform, with a simultaneous band.
+
+    Returns:
+        `difference`, and the band from `lower` to `upper`, over `at`; None for fewer than two.
+    """
     pit = pit[np.isfinite(pit)]
     if pit.size < 2:
         return None
@@ -85,7 +77,8 @@ def pit_band(pit: np.ndarray, most: int = 500) -> PitBand | None:
     at, lower, upper = _uniform_band(pit.size)
     ecdf = np.searchsorted(np.sort(pit), at, side="right") / pit.size
     ecdf[[0, -1]] = 0.0, 1.0
-    return PitBand(at=at, difference=ecdf - at, lower=lower - at, upper=upper - at)
+    curves = {"difference": ecdf, "lower": lower, "upper": upper}
+    return xr.Dataset({name: ("at", curve - at) for name, curve in curves.items()}, {"at": at})
 
 
 @functools.lru_cache(maxsize=64)
@@ -97,9 +90,11 @@ def _uniform_band(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def usable_readings(
-    result: xr.DataTree, name: str, flags: Mapping[str, bool] = COMPARABLE
+    result: xr.DataTree,
+    name: str,
+    flags: Mapping[str, bool] = MappingProxyType({"valid": True, "saturated": False}),
 ) -> np.ndarray:
-    """Which readings of a variable are finite and have these flags."""
+    """Which readings are finite and have these flags: by default, those of a fair comparison."""
     observed = result["observed_data"].to_dataset()[name]
     usable = np.isfinite(observed.to_numpy())
     constants = result["constant_data"].to_dataset() if "constant_data" in result.children else {}

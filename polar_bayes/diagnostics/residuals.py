@@ -21,9 +21,9 @@ Moran (1950), Biometrika 37, 17 (spatial autocorrelation); Cook (1977), Technome
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from polar_bayes.diagnostics.finding import Finding, judged_by, listed, p_text
@@ -64,7 +64,7 @@ def residuals_of(fit: FitView) -> Residuals | None:
     noise_free = np.concatenate([v.noise_free for v in variables], axis=1)
     noise = np.concatenate([v.predicted for v in variables], axis=1) - noise_free
     observed = np.concatenate([v.observed for v in variables])
-    where = [_positions(result, v) for v in variables]
+    readings = pd.concat([_readings(result, v) for v in variables], ignore_index=True)
     sd = noise.std(axis=0)
     # Replicates of a reading near full scale are cut off there, and have no residuals of their own.
     cut = np.concatenate([(v.predicted >= v.full_scale).mean(axis=0) for v in variables])
@@ -83,60 +83,44 @@ def residuals_of(fit: FitView) -> Residuals | None:
     scores = np.array([(x - x.mean()) / x.std() for x in material.values()]).reshape(
         len(material), len(centered)
     )
-    group = [name for each in where for name in each.group]
-    labels = [label for each in where for label in each.labels]
-    groups = {name: number for number, name in enumerate(dict.fromkeys(group))}
+    used = readings.iloc[keep]
     return Residuals(
         observed=observed[keep] / sd - noise_free.mean(axis=0),
         replicated=replicated,
-        stated=np.concatenate([each.stated for each in where])[keep] / sd,
+        stated=used["stated"].to_numpy() / sd,
         left_out=np.maximum(replicated.var(axis=0), 1.0 - LIMITS.leverage),
         gains=scores @ centered / (len(centered) - 1),
         parameters=tuple(material),
-        directions=np.concatenate([each.directions for each in where])[keep],
-        wavelength=np.concatenate([each.wavelength for each in where])[keep],
-        group=np.array([groups[name] for name in group])[keep],
-        labels=tuple(str(labels[i]) for i in keep),
+        directions=used[[*ANGLES]].to_numpy(),
+        wavelength=used["wavelength"].to_numpy(),
+        group=pd.factorize(readings["group"])[0][keep],
+        labels=tuple(used["label"]),
     )
 
 
-class _Positions(NamedTuple):
-    """Where each reading of a variable was read."""
-
-    directions: np.ndarray  # (reading, 4), degree
-    wavelength: np.ndarray  # (reading,)
-    stated: np.ndarray  # (reading,): stated error, 0 where there is none
-    group: list[str]
-    labels: list[str]
-
-
-def _positions(result: xr.DataTree, variable: FlatVariable) -> _Positions:
-    """Directions, wavelength, group and label of every reading of a variable."""
+def _readings(result: xr.DataTree, variable: FlatVariable) -> pd.DataFrame:
+    """Directions, wavelength, stated error (0 where there is none), group and label of readings."""
     reading = result["observed_data"].to_dataset()[variable.name]
     constants = result["constant_data"].to_dataset()
 
     def along(values: xr.DataArray) -> np.ndarray:
         return values.variable.set_dims(reading.sizes).to_numpy()[variable.usable]
 
-    angles = [along(constants[name]) for name in ANGLES]
-    wavelength = np.zeros(variable.observed.size)
-    if "wavelength" in reading.coords and "wavelength" in reading.dims:
-        wavelength = along(reading["wavelength"])
-    stated = np.zeros(variable.observed.size)
-    if f"{variable.name}_error" in constants:
-        stated = np.nan_to_num(along(constants[f"{variable.name}_error"]).astype(float))
-    others = [str(dim) for dim in reading.dims if dim not in ("view", "wavelength")]
-    index = [along(xr.DataArray(np.arange(reading.sizes[dim]), dims=dim)) for dim in others]
-    group = [
-        " ".join([variable.name, *(str(each[i]) for each in index)])
-        for i in range(variable.observed.size)
-    ]
-    colored = len(np.unique(wavelength)) > 1
-    labels = [
+    found = pd.DataFrame({name: along(constants[name]) for name in ANGLES})
+    is_spectral = "wavelength" in reading.coords and "wavelength" in reading.dims
+    found["wavelength"] = along(reading["wavelength"]) if is_spectral else 0.0
+    error = constants.get(f"{variable.name}_error", xr.DataArray(0.0)).astype(float)
+    found["stated"] = np.nan_to_num(along(error))
+    found["group"] = variable.name
+    for dim in (str(x) for x in reading.dims if x not in ("view", "wavelength")):
+        place = along(xr.DataArray(np.arange(reading.sizes[dim]), dims=dim))
+        found["group"] += [f" {at}" for at in place]
+    colored = found["wavelength"].nunique() > 1
+    found["label"] = [
         f"{variable.name} at {zenith:.3g} degrees" + (f", {length:g} nm" if colored else "")
-        for zenith, length in zip(angles[0], wavelength, strict=True)
+        for zenith, length in zip(found[ANGLES[0]], found["wavelength"], strict=True)
     ]
-    return _Positions(np.stack(angles, axis=1), wavelength, stated, group, labels)
+    return found
 
 
 def residual_findings(residuals: Residuals | None) -> dict[str, Finding]:

@@ -31,8 +31,6 @@ from polar_bayes.errors import CaptureError
 from polar_bayes.paths import existing_file, system_error
 
 LARGEST_FILE = 50_000_000  # bytes
-VOTERS = 1000
-"""Lines, at most, that decide what separates cells."""
 EACH_READING = "give a line for each reading"
 AS_TEXT = "save the table as UTF-8 text, such as CSV, or as .xlsx"
 NO_READING = frozenset(("", "-", "--", "nan", "na", "n/a", "#n/a", "none", "null"))
@@ -46,7 +44,6 @@ STATISTICS = frozenset(
 DIGITS = r"[+-]?(?:[0-9]+(?:\.[0-9]*|,[0-9]+)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"
 NUMBER = re.compile(rf"({DIGITS})()()")
 WITH_ERROR = re.compile(rf"({DIGITS}) ?(?:± ?({DIGITS})|\(([0-9]+(?:[.,][0-9]+)?)\))")
-PLUS_MINUS = re.compile(r"[ \t]*(?:±|\+/-|\+-)[ \t]*")
 # A run of digits in groups of three, whose mark is no decimal one: 1'234, or 1 234 with a blank
 # that does not break.
 GROUPS = re.compile(r"(?<=[0-9])[\u00a0\u2009\u202f'\u2019](?=[0-9]{3}(?![0-9]))")
@@ -202,7 +199,8 @@ def _text_lines(file: Path, content: bytes) -> Cells:
     for number, line in enumerate(re.split("\r\n|\r|\n", text), 1):
         before, _, comment = line.partition("#")
         if before.strip():
-            plain.append((number, PLUS_MINUS.sub("±", before.strip(" "))))
+            signs = re.sub(r"[ \t]*(?:±|\+/-|\+-)[ \t]*", "±", before.strip(" "))
+            plain.append((number, signs))
         elif comment.strip():
             comments.append((number, comment.strip()))
     try:
@@ -221,7 +219,7 @@ def _separator(contents: list[str]) -> str:
     """What separates cells in most lines that hold numbers alone."""
     votes = collections.Counter(
         mark
-        for content in contents[:VOTERS]
+        for content in contents[:1000]
         for mark in [_mark(content)]
         if all(map(_is_blank_or_number, _split_by(mark, content)))
     )

@@ -35,14 +35,12 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from polar_bayes.capture.schema import as_numbers, validate
+from polar_bayes.capture.schema import as_numbers, check_choice, validate
 from polar_bayes.errors import CaptureError
 from polar_bayes.importers.columns import Table, counted, read_table
 from polar_bayes.importers.mirror import as_incidence, mirror_views
 from polar_bayes.importers.table import MUELLER, capture_of_lines
 
-LIGHT_ANGLE = -45.0
-"""Light polarized at 45 degrees of an ellipsometer, in the axes of `LinearPolarization`, degree."""
 PSI_ERROR, DELTA_ERROR, ELEMENT_ERROR = 0.1, 0.2, 0.005
 """Errors where none are stated: psi and delta in degrees, and an element of a Mueller matrix."""
 TO_NM = {"nm": 1.0, "angstroms": 0.1, "angstrom": 0.1, "um": 1000.0, "µm": 1000.0}
@@ -101,8 +99,8 @@ def from_ellipsometer(
     Raises:
         CaptureError: An option, the file, a line or a reading that is wrong.
     """
-    _check_choice("unit", unit, tuple(UNITS))
-    _check_choice("mueller", mueller, ("column", "row"))
+    check_choice(unit, (None, *UNITS), "unit")
+    check_choice(mueller, (None, "column", "row"), "mueller")
     given: dict[str, Given] = {
         "angle": angle, "psi": psi or None, "delta": delta or None, "wavelength": wavelength,
         "psi_error": psi_error, "delta_error": delta_error,
@@ -132,11 +130,6 @@ def from_ellipsometer(
     return validate(capture, source=capture.attrs["name"])
 
 
-def _check_choice(key: str, value: str | None, allowed: tuple[str, ...]) -> None:
-    if value is not None and value not in allowed:
-        raise CaptureError(f"it is {value!r}", where=key, hint=f"give {' or '.join(allowed)}")
-
-
 def _incidence(read: Table, values: Mapping[str, np.ndarray], angle_is: str | None) -> np.ndarray:
     """The angle of incidence of each line."""
     if "angle" not in values:
@@ -158,7 +151,8 @@ def _capture(
         notes.append(counted(masked, "blank reading", "masked"))
     capture = capture_of_lines(lines)
     if "u" in capture:
-        capture["u"].attrs["light_angle"] = LIGHT_ANGLE
+        # Light polarized at 45 degrees of an ellipsometer, in the axes of `LinearPolarization`.
+        capture["u"].attrs["light_angle"] = -45.0
     return capture
 
 

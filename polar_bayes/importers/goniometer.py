@@ -59,8 +59,6 @@ SMALLEST_ERROR, LARGEST_READING = 1e-30, 1e30
 LEVEL = Interval(-LARGEST_READING, LARGEST_READING, open_low=True, open_high=True)
 RELATIVE_ERROR = 0.01
 """Error of a reading over the reading, where neither a user nor repeats tell it."""
-FEWEST_REPEATS = 6
-"""Readings beyond the first of their angles below which the scatter is not told."""
 
 
 def from_goniometer(
@@ -309,7 +307,7 @@ class Rows(NamedTuple):
         notes = list(self.notes)
         square = np.bincount(group, (self.reading - mean[group]) ** 2)
         beyond = self.reading.size - angle.size
-        told = beyond >= FEWEST_REPEATS and bool(square.any())
+        told = beyond >= 6 and bool(square.any())  # fewer do not tell the scatter
         if told:
             several = count > 1
             scatter = _scatter(mean[several], square[several], count[several] - 1)

@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from polar_bayes.capture.schema import ZENITH
+from polar_bayes.capture.schema import ZENITH, check_choice
 from polar_bayes.errors import CaptureError
 
 ANGLE_IS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = MappingProxyType(
@@ -43,9 +43,7 @@ def as_incidence(
     Raises:
         CaptureError: The first angle in the order of the file that is none, or no such scale.
     """
-    if angle_is is not None and angle_is not in ANGLE_IS:
-        hint = f"give one of {', '.join(ANGLE_IS)}"
-        raise CaptureError(f"it is {angle_is!r}", where="angle_is", hint=hint)
+    check_choice(angle_is, (None, *ANGLE_IS), "angle_is")
     found = angle if angle_is is None else ANGLE_IS[angle_is](np.abs(angle))
     if (wrong := ~ZENITH.contains(found)).any():
         first = int(np.argmax(wrong))

@@ -31,6 +31,7 @@ from polar_bayes.capture.schema import (
     WAVELENGTH,
     Interval,
     Variable,
+    check_choice,
     hint_for,
     nearest_name,
     validate,
@@ -39,11 +40,11 @@ from polar_bayes.errors import CaptureError
 from polar_bayes.importers.columns import Table, check_column, counted, read_table
 from polar_bayes.importers.mirror import as_incidence
 
-AOLP = Variable(
+KNOWN = {row.name: row for row in (*CONTRACT, WAVELENGTH)}
+KNOWN["aolp"] = Variable(
     "aolp", "reading", "degree", Interval(-360.0, 360.0), "angle of linear polarization",
     "give degrees from the s axis, or from the p axis by aolp_from='p'", "dop",
 )  # fmt: skip
-KNOWN = {row.name: row for row in (*CONTRACT, WAVELENGTH, AOLP)}
 AXES = {"s": 0.0, "p": 90.0}
 """Angle of each axis from the s axis, degree."""
 MUELLER = re.compile(r"[mM]_?\[?([0-4])_?,?([0-4])\]?")
@@ -94,10 +95,13 @@ def from_table(
         CaptureError: The column, or the line and number, that is wrong.
     """
     given, constants, used = dict(columns or {}), dict(constants or {}), {}
-    _check_options(angle, angle_is, aolp_from)
+    check_choice(aolp_from, AXES, "aolp_from")
     if angle is not None:
         given |= {"view_zenith": angle, "light_zenith": angle}
         constants = {"view_azimuth": 180.0, "light_azimuth": 0.0, **constants}
+    elif angle_is is not None:
+        hint = "name the column by angle="
+        raise CaptureError("the angle of a mirror is not named", where="angle_is", hint=hint)
 
     def chosen(names: list[str]) -> list[str]:
         """The columns that are used; a line without the first one is left out."""
@@ -121,26 +125,14 @@ def from_table(
     if "aolp" in values:
         values |= _normalized_stokes(values, AXES[aolp_from], source)
         notes.append(f"q and u follow from dop and aolp, which counts from {aolp_from}")
-    capture = _of_materials(values, saturation_level, source)
-    capture = capture.assign_attrs(
-        source=Path(source).name, name=name or Path(source).stem, angle_set_by=angle_set_by
-    )
-    if setup is not None:
-        capture.attrs["setup"] = setup
-    if notes:
-        capture.attrs["import_notes"] = "; ".join(notes)
+    attributes = {"source": Path(source).name, "name": name or Path(source).stem}
+    attributes |= {"angle_set_by": angle_set_by} | ({} if setup is None else {"setup": setup})
+    attributes |= {"import_notes": "; ".join(notes)} if notes else {}
+    capture = _of_materials(values, saturation_level, source).assign_attrs(attributes)
     return validate(capture, source=source)
 
 
 # --- Columns --------------------------------------------------------------------------------------
-
-
-def _check_options(angle: str | None, angle_is: str | None, aolp_from: str) -> None:
-    if aolp_from not in AXES:
-        raise CaptureError(f"it is {aolp_from!r}", where="aolp_from", hint="give s or p")
-    if angle is None and angle_is is not None:
-        hint = "name the column by angle="
-        raise CaptureError("the angle of a mirror is not named", where="angle_is", hint=hint)
 
 
 def _columns(

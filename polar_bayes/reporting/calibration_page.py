@@ -1,6 +1,7 @@
 """The report of a calibration: ranks, coverage, estimates, and the status of its fits."""
 
 import enum
+import functools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -65,13 +66,10 @@ def calibration_page(
     shown = list(ranks.values())
     other_ranks = {name: figures.parameter_ranks(each) for name, each in others.items()}
     colors = f" Band and dots are those of {method}; the others are drawn over it."
-
-    def ecdf(some: Sequence[Ranks]) -> Figure:
-        return figures.ecdf_differences(some, other_ranks, method)
-
-    def coverage(some: Sequence[Ranks]) -> Figure:
-        return figures.interval_coverage(some, other_ranks, method)
-
+    ecdf, coverage = (
+        functools.partial(draw, others=other_ranks, method=method)
+        for draw in (figures.ecdf_differences, figures.interval_coverage)
+    )
     rank_figures = [
         *_paged(shown, ecdf, "ecdf", colors=colors if others else ""),
         *_paged(shown, figures.rank_histograms, "histograms"),

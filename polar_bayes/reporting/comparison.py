@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from polar_bayes.diagnostics.compare import FitComparison, compare_fits
 from polar_bayes.diagnostics.limits import LIMITS
@@ -59,11 +58,7 @@ def plot_comparison(comparison: FitComparison) -> Figure:
         axes.spines["left"].set_visible(False)
         axes.locator_params(axis="x", nbins=5)
         style.set_panel_title(axes, style.label_text(label.replace("_", " ")))
-    handles = [
-        Line2D([], [], color=color, marker="o", ms=4.5, lw=2.0, label=style.label_text(name, 24))
-        for name, color in colors.items()
-    ]
-    style.add_legend(figure, handles, columns=4)
+    style.add_legend(figure, 4, colors)
     return figure
 
 

@@ -538,28 +538,22 @@ def convergence_table(fit: FitView) -> Table:
     return fit_table(fit, "fit.convergence", cells, data)
 
 
-SAMPLER_FACTS: Mapping[str, tuple[str, Callable[[xr.DataArray], object]]] = {
-    "diverging": ("divergences", lambda flags: int(flags.sum())),
-    "reached_max_treedepth": (
-        "draws at the largest tree depth",
-        lambda flags: f"{int(flags.sum())} of {flags.size}",
-    ),
-    "acceptance_rate": ("mean acceptance", lambda rates: f"{float(rates.mean()):.2f}"),
-    "step_size": (
-        "step size of each chain",
-        lambda sizes: [f"{size:.3g}" for size in sizes.isel(draw=-1).to_numpy()],
-    ),
-}
-
-
 def _sampler_facts(fit: FitView) -> dict[str, object]:
     """What the sampler or approximation reports of itself."""
     stats, modes = fit.stats, fit.provenance.get("modes") or {}
-    facts = {
-        title: describe(stats[name])
-        for name, (title, describe) in SAMPLER_FACTS.items()
-        if name in stats
+    told: Mapping[str, tuple[str, Callable[[xr.DataArray], object]]] = {
+        "diverging": ("divergences", lambda x: int(x.sum())),
+        "reached_max_treedepth": (
+            "draws at the largest tree depth",
+            lambda x: f"{int(x.sum())} of {x.size}",
+        ),
+        "acceptance_rate": ("mean acceptance", lambda x: f"{float(x.mean()):.2f}"),
+        "step_size": (
+            "step size of each chain",
+            lambda x: [f"{size:.3g}" for size in x.isel(draw=-1).to_numpy()],
+        ),
     }
+    facts = {title: tell(stats[name]) for name, (title, tell) in told.items() if name in stats}
     pareto_k = fit.provenance.get("pareto_k")
     if fit.method in APPROXIMATIONS and "log_weight" in stats:
         pareto_k = convergence.laplace_pareto_k(fit)

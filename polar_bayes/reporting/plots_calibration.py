@@ -9,7 +9,6 @@ import xarray as xr
 from arviz_stats.base import array_stats
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from polar_bayes.calibration.scores import EcdfBand, ecdf_band, histogram_band, significance_level
 from polar_bayes.calibration.verdict import CalibrationView, calibration_view
@@ -142,10 +141,14 @@ def estimate_panel(axes: Axes, ranks: Ranks) -> None:
     truth, mean, low, high = ranks.estimates[:, shown]
     answered = np.isfinite(mean) & np.isfinite(low + high)
     held = answered & (low <= truth) & (truth <= high)
-    for which, color, order in ((held, BLUE, 2), (answered & ~held, ORANGE, 3)):
+    for which, color, order, label in (
+        (held, BLUE, 2, "holds the truth"),
+        (answered & ~held, ORANGE, 3, "misses it"),
+    ):
+        dot: style.Look = {"ms": 2.2, "mew": 0, "zorder": order + 2, "label": label}
         light = style.lighten(color, 0.5)
         axes.vlines(truth[which], low[which], high[which], color=light, lw=0.7, zorder=order)
-        axes.plot(truth[which], mean[which], "o", color=color, ms=2.2, mew=0, zorder=order + 2)
+        axes.plot(truth[which], mean[which], "o", color=color, **dot)
     # Of both axes: all truths and means, whatever the longest intervals reach.
     values = np.concatenate([truth[np.isfinite(truth)], mean[answered]])
     values = values if values.size else np.array([0.0, 1.0])
@@ -157,12 +160,13 @@ def estimate_panel(axes: Axes, ranks: Ranks) -> None:
     else:
         limits = style.padded_range(values, 0.05)
         axes.locator_params(nbins=4)
-    axes.plot(limits, limits, color=GRAY, lw=0.9, ls="--", zorder=1)
+    axes.plot(limits, limits, color=GRAY, lw=0.9, ls="--", zorder=1, label="mean = truth")
     axes.set(xlim=limits, ylim=limits)
     failed = truth[~answered]
     if failed.size:
         below: style.Look = {"transform": axes.get_xaxis_transform(), "clip_on": False, "zorder": 6}
-        axes.plot(failed, 0.0 * failed, "x", color=VERMILLION, ms=4, mew=1, **below)
+        below |= {"ms": 4, "mew": 1, "label": "fit failed"}
+        axes.plot(failed, 0.0 * failed, "x", color=VERMILLION, **below)
 
 
 # --- Figures --------------------------------------------------------------------------------------
@@ -272,14 +276,7 @@ def interval_coverage(
 def estimates(ranks: Sequence[Ranks]) -> Figure:
     """Posterior means with 80% intervals against the truth."""
     figure = _panels(ranks, estimate_panel, ("truth", "mean and 80% interval"), 2.3)
-    handles = [
-        Line2D([], [], color=BLUE, marker="o", ms=3, label="holds the truth"),
-        Line2D([], [], color=ORANGE, marker="o", ms=3, label="misses it"),
-        Line2D([], [], color=GRAY, ls="--", label="mean = truth"),
-    ]
-    if any(each.answered.size < each.pit.size for each in ranks):
-        handles.append(Line2D([], [], color=VERMILLION, marker="x", ls="", label="fit failed"))
-    _add_legend(figure, handles)
+    style.add_legend(figure, columns=4 if figure.get_figwidth() > 6.0 else 2)
     return figure
 
 
@@ -305,19 +302,10 @@ def _title_with_p(ranks: Ranks) -> str:
     return f"{style.wrap(ranks.title, 30)}\np = {or_dash(ranks.row['p_value'], '.2g')}"
 
 
-def _add_legend(figure: Figure, handles: Sequence[Line2D]) -> None:
-    style.add_legend(figure, handles, columns=4 if figure.get_figwidth() > 6.0 else 2)
-
-
 def _method_colors(others: Mapping[str, object]) -> dict[str, str]:
     return {name: METHOD_COLORS[at % len(METHOD_COLORS)] for at, name in enumerate(others)}
 
 
 def _name_methods(figure: Figure, method: str, colors: Mapping[str, str]) -> None:
     named = {method: BLUE, **colors} if colors else {}
-    handles = [
-        Line2D([], [], color=color, label=style.label_text(name, 24))
-        for name, color in named.items()
-    ]
-    if handles:
-        _add_legend(figure, handles)
+    style.add_legend(figure, 4 if figure.get_figwidth() > 6.0 else 2, named)

@@ -5,11 +5,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import xarray as xr
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from polar_bayes.diagnostics.parameters import SAMPLE_DIMS, Scalar, is_hyperparameter, scalars
 from polar_bayes.diagnostics.view import FitView, once, view_of
@@ -140,12 +137,11 @@ def readings_at_a_glance(fit: FitView) -> Figure:
     figure = style.NotebookFigure(figsize=(4.6, 3.3), layout="constrained")
     axes = figure.subplots()
     limit = float(fit.provenance.get("largest_view_zenith", 90.0))
-    drawn = _draw_curve(axes, _at(curve, chosen), limit)
+    _draw_curve(axes, _at(curve, chosen), limit)
     shown = [style.label_text(part) for part in (curve.attrs["title"], title) if part]
     axes.set(xlabel="view zenith [degree]", ylabel=SHORT[name], xlim=_zenith_limits([curve]))
     axes.set_title(style.wrap(", ".join(shown), 44))
-    handles = [handle for key, handle in _reading_handles().items() if key in drawn]
-    style.add_legend(figure, handles, columns=2)
+    style.add_legend(figure, columns=2)
     return figure
 
 
@@ -178,16 +174,14 @@ def _draw_readings(fit: FitView, found: list[xr.Dataset], label: str, short_labe
         shown = found[: MAX_ROWS // 2 * COLUMNS]
         figure, panels = _panels_by_curve(shown, label)
     limit = float(fit.provenance.get("largest_view_zenith", 90.0))
-    drawn: set[str] = set()
     for axes, curve in panels:
-        drawn |= _draw_curve(axes, curve, limit)
+        _draw_curve(axes, curve, limit)
     figure.axes[0].set_xlim(*_zenith_limits(found))
     where = f", {_azimuth_title(azimuths[0])}" if len(azimuths) == 1 else ""
     # Not as a title: there the legend would cover it.
     part = f" (the first {len(shown)} of {len(found)})" if len(found) > len(shown) else ""
     figure.supxlabel(f"view zenith [degree]{where}{part}")
-    handles = [handle for key, handle in _reading_handles().items() if key in drawn]
-    style.add_legend(figure, handles, columns=4 if figure.get_figwidth() > 7.0 else 3)
+    style.add_legend(figure, columns=4 if figure.get_figwidth() > 7.0 else 3)
     return figure
 
 
@@ -251,70 +245,46 @@ def _azimuth_title(azimuth: float) -> str:
     return f"azimuth {azimuth:g}°{side}"
 
 
-def _draw_curve(axes: Axes, curve: xr.Dataset, limit: float) -> set[str]:
-    """Draw one panel; returns the keys of the legend entries that it uses."""
-    drawn = _draw_prediction(axes, curve)
-    markers = _reading_markers()
+def _draw_curve(axes: Axes, curve: xr.Dataset, limit: float) -> None:
+    """Draw one panel."""
     zenith, readings = curve["zenith"].to_numpy(), curve["observed"].to_numpy()
+    if zenith.size:
+        _draw_prediction(axes, curve, zenith)
     observed, saturated = np.isfinite(readings), curve["saturated"].to_numpy()
-    for key, chosen in (("reading", observed & ~saturated), ("saturated", observed & saturated)):
+    ink = style.text_color()
+    dot: style.Look = {"marker": "o", "ms": 3.4, "color": ink, "label": "reading"}
+    full: style.Look = {"marker": "^", "ms": 5.5, "color": VERMILLION, "label": "saturated"}
+    full |= {"mec": ink, "mew": 0.5}
+    for chosen, look in ((observed & ~saturated, dot), (observed & saturated, full)):
         if chosen.any():
-            axes.plot(zenith[chosen], readings[chosen], zorder=5, **markers[key])
-            drawn.add(key)
+            axes.plot(zenith[chosen], readings[chosen], ls="none", zorder=5, **look)
     masked = zenith[~observed]
     if masked.size:
-        transform = axes.get_xaxis_transform()
-        height = np.full(masked.size, 0.03)
-        axes.plot(masked, height, transform=transform, clip_on=False, **markers["masked"])
-        drawn.add("masked")
+        cross: style.Look = {"ms": 4.5, "color": GRAY, "mew": 1.1, "label": "masked: not fitted"}
+        cross |= {"transform": axes.get_xaxis_transform(), "clip_on": False}
+        axes.plot(masked, np.full(masked.size, 0.03), "x", **cross)
     if limit < 90.0:
-        axes.axvspan(limit, 90.0, color=lighten(GRAY, 0.9), lw=0, zorder=0)
-        drawn.add("aside")
-    return drawn
+        aside: style.Look = {"lw": 0, "zorder": 0, "label": "set aside: beyond the angle limit"}
+        axes.axvspan(limit, 90.0, color=lighten(GRAY, 0.9), **aside)
 
 
-def _draw_prediction(axes: Axes, curve: xr.Dataset) -> set[str]:
-    zenith, levels = curve["zenith"].to_numpy(), curve["levels"].to_numpy()
-    if not zenith.size:
-        return set()
-    is_smooth = _is_smooth(curve)
+def _draw_prediction(axes: Axes, curve: xr.Dataset, zenith: np.ndarray) -> None:
+    levels, is_smooth = curve["levels"].to_numpy(), _is_smooth(curve)
     line: style.Look = {"marker": "_", "ms": 7, "mew": 1.4, "ls": ""}
     line = {"lw": 1.4} if is_smooth else line
-    axes.plot(zenith, curve["center"].to_numpy(), color=BLUE, zorder=3, **line)
+    center = curve["center"].to_numpy()
+    axes.plot(zenith, center, color=BLUE, zorder=3, label="fitted curve", **line)
     # Where a reading is missing, so may be its error: the scatter there is not known.
     known = curve["fitted"].to_numpy() & np.isfinite(levels).all(axis=0)
-    if not known.any():
-        return {"median"}
     zenith, levels = zenith[known], levels[:, known]
-    for inner, share, width in ((0, 0.78, 2.0), (1, 0.5, 4.5)):
+    for inner, share, width in ((0, 0.78, 2.0), (1, 0.5, 4.5)) if known.any() else ():
         low, high = levels[inner], levels[-1 - inner]
-        color = lighten(BLUE, share)
+        look: style.Look = {"color": lighten(BLUE, share)}
+        look["label"] = f"{'50%' if inner else '95%'} of new readings"
         if is_smooth:
-            axes.fill_between(zenith, low, high, color=color, lw=0)
+            axes.fill_between(zenith, low, high, lw=0, **look)
         else:
-            axes.vlines(zenith, low, high, color=color, lw=width)
-    return {"median", "half", "most"}
-
-
-def _reading_markers() -> dict[str, style.Look]:
-    edge = {"mec": style.text_color(), "mew": 0.5}
-    return {
-        "reading": {"ls": "none", "marker": "o", "ms": 3.4, "color": style.text_color()},
-        "saturated": {"ls": "none", "marker": "^", "ms": 5.5, "color": VERMILLION, **edge},
-        "masked": {"ls": "none", "marker": "x", "ms": 4.5, "color": GRAY, "mew": 1.1},
-    }
-
-
-def _reading_handles() -> dict[str, Artist]:
-    labels = {"reading": "reading", "saturated": "saturated", "masked": "masked: not fitted"}
-    markers = _reading_markers()
-    return {
-        **{key: Line2D([], [], label=labels[key], **markers[key]) for key in labels},
-        "aside": Patch(color=lighten(GRAY, 0.9), label="set aside: beyond the angle limit"),
-        "median": Line2D([], [], color=BLUE, lw=1.4, label="fitted curve"),
-        "half": Patch(color=lighten(BLUE, 0.5), label="50% of new readings"),
-        "most": Patch(color=lighten(BLUE, 0.78), label="95% of new readings"),
-    }
+            axes.vlines(zenith, low, high, lw=width, **look)
 
 
 # --- Parameters against wavelength ----------------------------------------------------------------
@@ -465,47 +435,31 @@ def plot_spectrum(result: xr.DataTree | FitView, name: str) -> Figure:
     part = f" (the first {len(shown)} of {int(total)})" if total > len(shown) else ""
     figure.supxlabel(f"wavelength [nm]{part}")
     figure.supylabel(shown[0].label)
-    style.add_legend(figure, _spectrum_handles(shown), columns=5)
+    style.add_legend(figure, columns=5)
     return figure
 
 
 def _draw_spectrum(axes: Axes, each: Spectrum) -> None:
+    middle: style.Look = {"color": BLUE, "zorder": 4, "label": "posterior median"}
     if each.is_band:
-        for at in each.measured:
-            axes.axvline(at, color=lighten(GRAY, 0.6), lw=0.7, ls=(0, (2, 2)), zorder=3)
-        for low, high, share in ((0, 4, 0.75), (1, 3, 0.45)):
-            color = lighten(BLUE, share)
-            axes.fill_between(each.at, each.levels[low], each.levels[high], color=color, lw=0)
-        axes.plot(each.at, each.levels[2], color=BLUE, lw=1.4, zorder=4)
+        axes.plot(each.at, each.levels[2], lw=1.4, **middle)
         limits = each.at[[0, -1]]
     else:
-        axes.vlines(each.measured, each.levels[0], each.levels[4], color=BLUE, lw=1.1)
-        axes.vlines(each.measured, each.levels[1], each.levels[3], color=BLUE, lw=3.6)
-        ring: style.Look = {"mfc": style.background(), "mec": BLUE, "ms": 4.5}
-        axes.plot(each.measured, each.levels[2], "o", ls="", **ring)
+        ring: style.Look = {"mfc": style.background(), "ms": 4.5}
+        axes.plot(each.measured, each.levels[2], "o", **middle, **ring)
         margin = 0.08 * np.ptp(each.measured)
         limits = each.measured[[0, -1]] + [-margin, margin]
+    for inner, share, width in ((0, 0.75, 1.1), (1, 0.45, 3.6)):
+        low, high, label = each.levels[inner], each.levels[-1 - inner], ("95%", "50%")[inner]
+        if each.is_band:
+            axes.fill_between(each.at, low, high, color=lighten(BLUE, share), lw=0, label=label)
+        else:
+            axes.vlines(each.measured, low, high, color=BLUE, lw=width, label=label)
+    for at in each.measured if each.is_band else ():
+        dashes: style.Look = {"ls": (0, (2, 2)), "zorder": 3, "label": "measured"}
+        axes.axvline(at, color=lighten(GRAY, 0.6), lw=0.7, **dashes)
     known = np.isfinite(each.true)
-    truth = {**style.true_value_style(), "mew": 0.6}
-    axes.plot(each.measured[known], each.true[known], zorder=6, **truth)
+    if known.any():
+        truth = {**style.true_value_style(), "mew": 0.6}
+        axes.plot(each.measured[known], each.true[known], zorder=6, **truth)
     axes.set_xlim(*limits)
-
-
-def _spectrum_handles(shown: Sequence[Spectrum]) -> list[Artist]:
-    dashes: style.Look = {"color": lighten(GRAY, 0.6), "lw": 0.9, "ls": (0, (2, 2))}
-    ring: style.Look = {"marker": "o", "mfc": style.background(), "ls": ""}
-    handles: list[Artist] = [
-        Line2D([], [], color=BLUE, label="posterior median", **ring),
-        Line2D([], [], color=BLUE, lw=3.6, label="50%"),
-        Line2D([], [], color=BLUE, lw=1.1, label="95%"),
-    ]
-    if shown[0].is_band:
-        handles = [
-            Line2D([], [], color=BLUE, lw=1.4, label="posterior median"),
-            Patch(color=lighten(BLUE, 0.45), label="50%"),
-            Patch(color=lighten(BLUE, 0.75), label="95%"),
-            Line2D([], [], label="measured", **dashes),
-        ]
-    if any(np.isfinite(each.true).any() for each in shown):
-        handles.append(style.true_value_handle())
-    return handles

@@ -1,18 +1,14 @@
 """Figures of a fit: its parameters, its checks, and the members of its populations."""
 
-import functools
 import itertools
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 from arviz_stats.base import array_stats
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator
 
 from polar_bayes.diagnostics.parameters import Scalar, is_hyperparameter
@@ -151,17 +147,14 @@ def plot_ranks(result: xr.DataTree | FitView) -> Figure:
         for chain, own in enumerate(order.reshape(chains, length)):
             share = np.histogram(own, edges)[0] * (len(edges) - 1) / length
             color = CHAIN_COLORS[chain % len(CHAIN_COLORS)]
-            axes.stairs(share, edges, color=color, lw=1.1, baseline=None)
+            label = f"chain {chain + 1}" if chain < len(CHAIN_COLORS) else ""
+            axes.stairs(share, edges, color=color, lw=1.1, baseline=None, label=label)
         axes.axhline(1.0, color=GRAY, lw=0.8, ls="--")
         axes.set(xlim=(0, 1), ylim=(0, max(2.0, axes.get_ylim()[1])), xticks=[0, 0.5, 1])
         style.set_panel_title(axes, parameter_title(scalar, fit.posterior))
     figure.supxlabel("rank among the draws of all chains (0 lowest, 1 highest)")
     figure.supylabel("density")
-    handles = [
-        Line2D([], [], color=color, label=f"chain {i + 1}")
-        for i, color in enumerate(CHAIN_COLORS[:chains])
-    ]
-    style.add_legend(figure, handles, columns=6)
+    style.add_legend(figure, columns=6)
     return figure
 
 
@@ -198,31 +191,23 @@ def plot_prior_posterior(result: xr.DataTree | FitView) -> Figure:
     own = [s for s in found if not is_hyperparameter(s.name, names)]
     found = [*common, *own][:MAX_PANELS]
     figure, panels = style.grid(len(found), panel_height=1.5, header=0.5)
-    any_truth = False
     for axes, scalar in zip(panels, found, strict=True):
-        prior, draws = fit.prior[scalar.label].draws.ravel(), scalar.draws.ravel()
-        ends = limits[scalar.label]
-        _scaled_histogram(axes, prior, ends, GRAY, 0.72)
-        _scaled_histogram(axes, draws, ends, BLUE, 0.45)
+        draws, ends = scalar.draws.ravel(), limits[scalar.label]
+        _scaled_histogram(axes, fit.prior[scalar.label].draws, ends, GRAY, 0.72, "prior")
+        _scaled_histogram(axes, draws, ends, BLUE, 0.45, "posterior")
         low, middle, high = np.quantile(draws, [0.025, 0.5, 0.975])
-        axes.plot([low, high], [-0.09, -0.09], color=BLUE, lw=3, solid_capstyle="butt")
+        bar: style.Look = {"color": BLUE, "lw": 3, "solid_capstyle": "butt"}
+        bar["label"] = "posterior median and 95% interval"
+        axes.plot([low, high], [-0.09, -0.09], **bar)
         axes.plot([middle], [-0.09], "|", color=style.text_color(), ms=8)
         true = fit.truth(scalar)
         if np.isfinite(true):
-            any_truth = True
-            axes.axvline(true, color=ORANGE, lw=1.6, ls="--")
+            axes.axvline(true, color=ORANGE, lw=1.6, ls="--", label="true value")
         axes.set(xlim=ends, ylim=(-0.18, 1.08), yticks=[])
         axes.spines["left"].set_visible(False)
         axes.locator_params(axis="x", nbins=5)
         style.set_panel_title(axes, parameter_title(scalar, fit.posterior))
-    handles: list[Patch | Line2D] = [
-        Patch(color=lighten(GRAY, 0.72), label="prior"),
-        Patch(color=lighten(BLUE, 0.45), label="posterior"),
-        Line2D([], [], color=BLUE, lw=3, label="posterior median and 95% interval"),
-    ]
-    if any_truth:
-        handles.append(Line2D([], [], color=ORANGE, ls="--", label="true value"))
-    style.add_legend(figure, handles, columns=4)
+    style.add_legend(figure, columns=4)
     return figure
 
 
@@ -266,7 +251,12 @@ def _pit_panel(axes: Axes, values: np.ndarray | None) -> None:
 
 
 def _scaled_histogram(
-    axes: Axes, values: np.ndarray, limits: tuple[float, float], color: str, share: float
+    axes: Axes,
+    values: np.ndarray,
+    limits: tuple[float, float],
+    color: str,
+    share: float,
+    label: str,
 ) -> None:
     """A histogram over its own range, scaled to height 1."""
     inside = values[(values >= limits[0]) & (values <= limits[1])]
@@ -276,7 +266,7 @@ def _scaled_histogram(
     if inside.size and np.ptp(inside) > 4.0 * bins * np.spacing(largest):  # numbers between them
         counts, edges = np.histogram(inside, bins)
     heights = counts / max(counts.max(), 1)  # nothing may be inside
-    axes.stairs(heights, edges, fill=True, color=lighten(color, share))
+    axes.stairs(heights, edges, fill=True, color=lighten(color, share), label=label)
     axes.stairs(heights, edges, color=color, lw=0.8)
 
 
@@ -351,9 +341,12 @@ def plot_shrinkage(result: xr.DataTree | FitView, label: str) -> Figure:
     figure = style.NotebookFigure(figsize=(7.0, max(height, 0.7) + 1.5), layout="constrained")
     axes = figure.subplots()
     axes.set_xlim(_shrinkage_limits(axes, population, whole, rows))
-    for part, share in (("new", 0.85), ("location", 0.6)):
-        color = lighten(GRAY, share)
-        axes.axvspan(whole[f"{part}_q2.5"], whole[f"{part}_q97.5"], color=color, lw=0)
+    for part, share, label in (
+        ("new", 0.85, "a new member, 95%"),
+        ("location", 0.6, "location of the population, 95%"),
+    ):
+        ends = whole[f"{part}_q2.5"], whole[f"{part}_q97.5"]
+        axes.axvspan(*ends, color=lighten(GRAY, share), lw=0, label=label)
     axes.axvline(whole["location"], color=GRAY, lw=0.9)
     for at, row in rows.iterrows():
         _draw_member(axes, float(at), row, size=3.6 if is_dense else 5.0)
@@ -365,7 +358,7 @@ def plot_shrinkage(result: xr.DataTree | FitView, label: str) -> Figure:
     part = f" ({len(rows)} of {count}, evenly from low to high)" if count > len(rows) else ""
     axes.set_xlabel(", ".join(names) + part)
     axes.tick_params(axis="y", length=0, labelsize=6.0 if is_dense else 7.5)
-    style.add_legend(figure, _shrinkage_legend(rows), columns=2)
+    style.add_legend(figure, columns=2)
     return figure
 
 
@@ -408,44 +401,21 @@ def _shrinkage_limits(
 def _draw_member(axes: Axes, at: float, row: pd.Series, *, size: float) -> None:
     low, high = axes.get_xlim()
     above, below = at + 0.17, at - 0.17  # alone and pooled
-    faint = lighten(PURPLE, 0.25)
+    faint: style.Look = {"color": lighten(PURPLE, 0.25), "lw": 0.9, "zorder": 2}
     if np.isfinite(row["unpooled"]):
         seen = float(np.clip(row["unpooled"], low, high))
         marker = "<" if row["unpooled"] < low else ">" if row["unpooled"] > high else "o"
         axes.plot([seen, row["mean"]], [above, below], color=GRAY, lw=0.7, zorder=2)
-        ends = [row["unpooled_q2.5"], row["unpooled_q97.5"]]
-        axes.plot(ends, [above] * 2, color=faint, lw=0.9, zorder=2)
-        hollow = {**_hollow(), "ms": size}
+        axes.plot([row["unpooled_q2.5"], row["unpooled_q97.5"]], [above] * 2, **faint)
+        hollow: style.Look = {"mfc": style.background(), "mec": PURPLE, "mew": 1.1, "ms": size}
+        hollow["label"] = "alone, without the population: about, 95%"
         axes.plot([seen], [above], marker, zorder=4, clip_on=False, **hollow)
     else:
-        axes.plot([low, high], [above] * 2, color=faint, lw=0.9, ls=(0, (1, 3)), zorder=2)
+        nothing = {**faint, "ls": (0, (1, 3)), "label": "alone it says nothing"}
+        axes.plot([low, high], [above] * 2, **nothing)
     axes.plot([row["q2.5"], row["q97.5"]], [below] * 2, color=BLUE, lw=1.8, zorder=3)
-    axes.plot([row["mean"]], [below], "o", color=BLUE, ms=size, mew=0, zorder=5)
+    pooled: style.Look = {"ms": size, "mew": 0, "zorder": 5, "label": "pooled: mean and 95%"}
+    axes.plot([row["mean"]], [below], "o", color=BLUE, **pooled)
     if np.isfinite(row["true"]):
         truth = {**style.true_value_style(), "ms": size + 1.2, "mew": 0.6}
         axes.plot([row["true"]], [below], zorder=6, **truth)
-
-
-def _hollow() -> style.Look:
-    """Marker of an estimate without pooling."""
-    return {"mfc": style.background(), "mec": PURPLE, "mew": 1.1, "ms": 5}
-
-
-def _shrinkage_legend(rows: pd.DataFrame) -> list[Artist]:
-    has_alone = np.isfinite(rows["unpooled"])
-    line = functools.partial(Line2D, [], [], lw=0.9)
-    handles: list[Artist] = [
-        line(color=BLUE, lw=1.8, marker="o", ms=5, label="pooled: mean and 95%")
-    ]
-    if has_alone.any():
-        label = "alone, without the population: about, 95%"
-        handles.append(line(color=lighten(PURPLE, 0.25), marker="o", label=label, **_hollow()))
-    if not has_alone.all():
-        handles.append(line(color=PURPLE, ls=(0, (1, 3)), label="alone it says nothing"))
-    handles += [
-        Patch(color=lighten(GRAY, 0.6), label="location of the population, 95%"),
-        Patch(color=lighten(GRAY, 0.85), label="a new member, 95%"),
-    ]
-    if np.isfinite(rows["true"]).any():
-        handles.append(style.true_value_handle())
-    return handles

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
+import matplotlib.style
 import numpy as np
 import xarray as xr
 from numpyro import distributions as dist
@@ -23,7 +24,6 @@ from polar_bayes.paths import as_path
 from polar_bayes.priors import describe_prior, prior_card
 from polar_bayes.reporting import text
 from polar_bayes.reporting.page import EXPLORER, has_explorer, report_of, write_page
-from polar_bayes.reporting.style import in_default_style
 from polar_bayes.repr_html import DisplaySummary, HTMLRepr, Row, Table
 from polar_bayes.results import kind_of, save, summary, verdict
 
@@ -37,8 +37,7 @@ HINTS = {
     "comparisons": "leave it out, or give what polar_bayes.calibrate returns",
 }
 
-
-@in_default_style
+@matplotlib.style.context("default")  # whatever style the user has, the same result: the same page
 def report(
     result: xr.DataTree | xr.Dataset | Mapping[str, xr.DataTree],
     directory: str | os.PathLike[str],
@@ -102,8 +101,11 @@ def render(result: Any, **options: Any) -> str:
     given = {name: value for name, value in options.items() if value is not None}
     for name in given:
         if name not in own.options:
-            owner = "calibrations" if name == "comparisons" else "maps"
-            raise FitError(f"it goes with {owner} only", where=f"report: {name}", hint=HINTS[name])
+            owner, hint = "maps", "leave it out: a fit carries the truth of its capture"
+            if name == "comparisons":
+                owner = "calibrations"
+                hint = "leave it out, or give what polar_bayes.calibrate returns"
+            raise FitError(f"it goes with {owner} only", where=f"report: {name}", hint=hint)
     return own.page(result, **given).html
 
 
@@ -121,8 +123,11 @@ def show(result: Any) -> DisplaySummary:
         CaptureError: A capture does not hold together.
         FitError: It is none of these.
     """
-    card = next((card for applies, card in VALUES if applies(result)), _result_card)
-    return card(result)
+    if _is_capture(result):
+        return _capture_card(result)
+    if isinstance(result, HTMLRepr):
+        return _value_card(result)
+    return prior_card(result) if _are_priors(result) else _result_card(result)
 
 
 def _result_card(result: Any) -> DisplaySummary:
@@ -197,11 +202,3 @@ def _described_card(result: xr.Dataset) -> DisplaySummary:
     return DisplaySummary(
         text.capture_name(provenance_of(result)), tuple(verdict(result).sentences), (table,)
     )
-
-
-VALUES: tuple[tuple[Callable[[Any], bool], Callable[[Any], DisplaySummary]], ...] = (
-    (_is_capture, _capture_card),
-    (lambda value: isinstance(value, HTMLRepr), _value_card),
-    (_are_priors, prior_card),
-)
-"""Cards of what is no result, in the order in which they are tried."""

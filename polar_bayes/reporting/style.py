@@ -10,11 +10,10 @@ import functools
 import io
 import math
 import textwrap
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 from typing import Any, override
 
 import matplotlib
-import matplotlib.style
 import numpy as np
 import xarray as xr
 from matplotlib.artist import Artist
@@ -91,17 +90,6 @@ def styled[**P, R](draw: Callable[P, R]) -> Callable[P, R]:
     return wrapper
 
 
-def in_default_style[**P, R](write: Callable[P, R]) -> Callable[P, R]:
-    """Run a function that writes a report in one style: the same result gives the same page."""
-
-    @functools.wraps(write)
-    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
-        with matplotlib.style.context("default"):
-            return write(*args, **kwargs)
-
-    return wrapper
-
-
 def _settings() -> Any:
     own: Any = matplotlib.rcParams
     default: Any = matplotlib.rcParamsDefault
@@ -162,9 +150,20 @@ def grid(
     return figure, [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
 
 
-def add_legend(figure: Figure, handles: Iterable[Artist], columns: int) -> None:
-    """A legend above the panels."""
-    figure.legend(handles=list(handles), loc="outside upper left", ncols=columns, frameon=False)
+def add_legend(figure: Figure, columns: int, colors: Mapping[str, str] = {}) -> None:
+    """A legend above the panels: names by their colors, then each label that was drawn, once."""
+    found: list[Artist] = [
+        Line2D([], [], color=color, lw=2.0, label=label_text(name, 24))
+        for name, color in colors.items()
+    ]
+    drawn: dict[object, Artist] = {}
+    for handle in (
+        handle for axes in figure.axes for handle in axes.get_legend_handles_labels()[0]
+    ):
+        drawn.setdefault(handle.get_label(), handle)
+    if found := [*found, *drawn.values()]:
+        place: Look = {"loc": "outside upper left", "ncols": columns, "frameon": False}
+        figure.legend(handles=found, **place)
 
 
 def set_panel_title(axes: Axes, title: str) -> None:
@@ -193,12 +192,8 @@ def write_in_panel(axes: Axes, text: str) -> None:
 
 def true_value_style() -> Look:
     """Marker of a true value."""
-    return {"marker": "d", "ls": "", "mfc": ORANGE, "mec": background(), "ms": 6.5}
-
-
-def true_value_handle() -> Line2D:
-    """Entry of a legend for the marker of a true value."""
-    return Line2D([], [], label="true value", **true_value_style())
+    look: Look = {"marker": "d", "ls": "", "mfc": ORANGE, "mec": background(), "ms": 6.5}
+    return {**look, "label": "true value"}
 
 
 # --- Labels ---------------------------------------------------------------------------------------

@@ -297,7 +297,6 @@ def index_sentences(fit: FitView) -> list[str]:
     if not found or fit.method == "point":
         return []
     rows = convergence.summary(fit).loc[[scalar.label for scalar in found]]
-    ends = [interval(row["q2.5"], row["q97.5"]) for _, row in rows.iterrows()]
     if len(found) > 4:
         low, high = numbers([rows["mean"].min(), rows["mean"].max()], rows["sd"].median())
         return [
@@ -305,10 +304,10 @@ def index_sentences(fit: FitView) -> list[str]:
             f"table below has the 95% interval of each."
         ]
     phrases = []
-    for scalar, (_, row), end in zip(found, rows.iterrows(), ends, strict=True):
-        places = coordinate_labels(scalar)
+    for scalar, (_, row) in zip(found, rows.iterrows(), strict=True):
+        places, ends = coordinate_labels(scalar), interval(row["q2.5"], row["q97.5"])
         at = f" at {join(places)}" if places else ""
-        phrases.append(f"{number(row['mean'], row['sd'])}{at} (95% interval {end})")
+        phrases.append(f"{number(row['mean'], row['sd'])}{at} (95% interval {ends})")
     return [f"The refractive index n is {join(phrases)}."]
 
 
@@ -341,11 +340,9 @@ def setup_beside_views(fit: FitView) -> list[str]:
     if "next_views" not in fit.result.children or wider.empty:
         return []
     label = str(wider.index[0])
-    better, now = better_known(fit, label), budget(fit).loc[label, "sd"]
-    return [
-        f"Without further views, the {better.meaning} known to {better.half} instead of "
-        f"{better.known} narrows the 95% interval of {label} by {1.0 - better.sd / now:.0%}."
-    ]
+    (what, sd), now = better_known(fit, label), budget(fit).loc[label, "sd"]
+    by = f"{1.0 - sd / now:.0%}"
+    return [f"Without further views, the {what} narrows the 95% interval of {label} by {by}."]
 
 
 def trust(fit: FitView) -> str:

@@ -31,7 +31,7 @@ from numpyro import distributions as dist
 from polar_bayes.capture.plausibility import allowing_prior, indices_by_eye
 from polar_bayes.capture.schema import validate
 from polar_bayes.diagnostics.compare import compare_predictions
-from polar_bayes.diagnostics.criticism import INDEX_PARAMETERS, criticize
+from polar_bayes.diagnostics.criticism import criticize
 from polar_bayes.diagnostics.predictive import predictive_checks
 from polar_bayes.diagnostics.view import FitView, view_of
 from polar_bayes.errors import FitError, SceneError, one_line
@@ -45,7 +45,7 @@ from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.instrument import Discrepancy
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.variants import unseen_layers
-from polar_bayes.priors import parse_prior, support_bounds
+from polar_bayes.priors import INDICES, parse_prior, support_bounds
 from polar_bayes.progress import Progress, no_progress, with_progress
 from polar_bayes.scenes.fit_request import fit_request
 from polar_bayes.scenes.library import (
@@ -190,7 +190,7 @@ def lifted_prior(arguments: "FitArguments", scene: Scene) -> dict[str, dist.Dist
     if not any(by_eye.values()):
         return {}
     priors, own = arguments.request(scene).priors, arguments.priors or {}
-    name = next((name for name in INDEX_PARAMETERS if name in priors), None)
+    name = next((name for name in INDICES if name in priors), None)
     if name is None or name in own:
         return {}
     text = allowing_prior(by_eye, support_bounds(priors[name]))
@@ -324,7 +324,7 @@ def _fitted(name: str, requests: list[Request], stage: str, share: float, report
 def _index_bound(fit: FitView) -> float:
     """The bound of its prior at which an interval of the index ends; NaN where none does."""
     for scalar in fit.scalars:
-        if scalar.name in INDEX_PARAMETERS:
+        if scalar.name in INDICES:
             ends = np.quantile(scalar.draws, CENTRAL_95)
             for bound in bounds_of(fit.provenance, scalar.name):
                 if np.abs(ends - bound).min() < NEAR_BOUND * np.ptp(ends):

@@ -30,7 +30,6 @@ from jaxtyping import Array, ArrayLike
 from numpyro import distributions as dist
 
 from polar_bayes.diagnostics.alternatives import NOTHING
-from polar_bayes.diagnostics.criticism import INDEX_PARAMETERS
 from polar_bayes.errors import FitError, SceneError
 from polar_bayes.inference.initialization import HEAVY_MODE, JointInit
 from polar_bayes.inference.problem import Problem, compile_request, make_problem
@@ -51,7 +50,7 @@ from polar_bayes.physics.instrument import AbstractInstrumentTerm, Discrepancy
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.surface import SmoothSurface
 from polar_bayes.physics.variants import alternatives_of
-from polar_bayes.priors import resolve_priors
+from polar_bayes.priors import INDICES, resolve_priors
 from polar_bayes.progress import Progress
 
 OTHER_STARTS, OTHER_SEARCHES = 100, 4
@@ -278,7 +277,7 @@ def _with_scene(
     potential = DifferencedPotential(program.evaluated, data, np.sqrt(np.diagonal(covariance)))
     # What only the other scene has starts at the median of its prior.
     own = [name for name in program.positions if name not in known]
-    moved = own + [name for name in both if name in INDEX_PARAMETERS]
+    moved = own + [name for name in both if name in INDICES]
     keys = dict(zip(moved, jax.random.split(key, len(moved)), strict=True))
     drawn = {name: np.asarray(priors[name].sample(keys[name], (OTHER_STARTS,))) for name in moved}
 
