@@ -21,6 +21,7 @@ def one_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(comparison, "MAX_ALTERNATIVES", 0)
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_a_report_says_what_it_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stages: list[str] = []
 
