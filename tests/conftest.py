@@ -16,6 +16,8 @@ import jax
 import pytest
 from pages import blank_pictures
 
+from polar_bayes.scenes.fit_request import fit_request
+
 jax.config.update("jax_enable_x64", True)
 gc.set_threshold(100_000, 50)  # traces are many objects and few cycles: a tenth of the time
 
@@ -43,8 +45,6 @@ def compiled_in_haste() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def without_comparisons() -> Iterator[None]:
     """Fits alone, without those of other scenes, which compile programs of their own."""
-    from polar_bayes.scenes.fit_request import fit_request
-
     alone = functools.partial(fit_request, with_comparisons=False)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("polar_bayes.scenes.fitting.fit_request", alone)
