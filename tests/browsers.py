@@ -85,12 +85,6 @@ def faults(driver: webdriver.Chrome) -> list[str]:
     return found + ([f"scrolls sideways: {needed} in {room}"] if needed > room else [])
 
 
-def photograph(driver: webdriver.Chrome, file: Path) -> None:
-    """The whole page as a picture."""
-    shot = driver.execute_cdp_cmd("Page.captureScreenshot", {"captureBeyondViewport": True})
-    file.write_bytes(base64.b64decode(shot["data"]))
-
-
 def printed(driver: webdriver.Chrome) -> bytes:
     """The page as it would be printed, on A4."""
     paper = {"paperWidth": 8.27, "paperHeight": 11.69, "printBackground": True}

@@ -4,6 +4,8 @@ What a test computes once need not be fast: XLA optimizes nothing but what the p
 it to (`polar_bayes.numerics.compile.compiled`), which takes a third of the time.
 """
 
+import functools
+import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +16,10 @@ import jax
 import pytest
 from pages import blank_pictures
 
+from polar_bayes.scenes.fit_request import fit_request
+
 jax.config.update("jax_enable_x64", True)
+gc.set_threshold(100_000, 50)  # traces are many objects and few cycles: a tenth of the time
 
 ROOT = Path(__file__).parents[1]
 
@@ -35,6 +40,15 @@ def compiled_in_haste() -> Iterator[None]:
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture(scope="module")
+def without_comparisons() -> Iterator[None]:
+    """Fits alone, without those of other scenes, which compile programs of their own."""
+    alone = functools.partial(fit_request, with_comparisons=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("polar_bayes.scenes.fitting.fit_request", alone)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -126,7 +126,9 @@ def settings_of_jax() -> Iterator[None]:
         ),
     ],
 )
-def test_the_python_of_a_page_runs(page, fits, tmp_path, monkeypatch):
+def test_the_python_of_a_page_runs(page, fits, tmp_path, monkeypatch, request):
+    if fits is OF_A_PLATE:
+        request.getfixturevalue("without_comparisons")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(pb, "fit", fits)
     namespace: dict[str, object] = {"__name__": page.stem}

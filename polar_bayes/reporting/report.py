@@ -37,6 +37,7 @@ HINTS = {
     "comparisons": "leave it out, or give what polar_bayes.calibrate returns",
 }
 
+
 @matplotlib.style.context("default")  # whatever style the user has, the same result: the same page
 def report(
     result: xr.DataTree | xr.Dataset | Mapping[str, xr.DataTree],
@@ -101,11 +102,8 @@ def render(result: Any, **options: Any) -> str:
     given = {name: value for name, value in options.items() if value is not None}
     for name in given:
         if name not in own.options:
-            owner, hint = "maps", "leave it out: a fit carries the truth of its capture"
-            if name == "comparisons":
-                owner = "calibrations"
-                hint = "leave it out, or give what polar_bayes.calibrate returns"
-            raise FitError(f"it goes with {owner} only", where=f"report: {name}", hint=hint)
+            owner = "calibrations" if name == "comparisons" else "maps"
+            raise FitError(f"it goes with {owner} only", where=f"report: {name}", hint=HINTS[name])
     return own.page(result, **given).html
 
 

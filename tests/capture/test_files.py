@@ -127,10 +127,7 @@ PAIR = np.dtype([("a", "f8"), ("b", "f8")])
 NO_NUMBERS = {
     "text": (lambda file: str, np.array(["0.1"] * 5, object)),
     "characters": (lambda file: "S1", np.array(list("01234"), "S1")),
-    "ragged": (
-        lambda file: file.createVLType(np.float64, "ragged"),
-        np.array([np.ones(k) for k in range(1, 6)], object),
-    ),
+    "ragged": (lambda file: file.createVLType(np.float64, "ragged"), RAGGED),
     "records": (lambda file: file.createCompoundType(PAIR, "pair"), np.zeros(5, PAIR)),
 }
 

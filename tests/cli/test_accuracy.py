@@ -1,7 +1,6 @@
 """The study and the automatic choice from the command line."""
 
 import json
-from pathlib import Path
 
 import pytest
 from synthetic_accuracy import make_accuracy
@@ -60,9 +59,7 @@ def test_rungs_and_dials_are_chosen_and_json_is_json(plate, tmp_path, capsys, st
 
 
 @pytest.mark.thorough
-def test_the_automatic_choice_says_what_it_did(
-    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
-) -> None:
+def test_the_automatic_choice_says_what_it_did(plate, tmp_path, capsys, monkeypatch) -> None:
     asked: dict[str, object] = {}
     fit = pb.fit
 

@@ -29,9 +29,7 @@ def test_a_calibration_has_a_page(files: Path, capsys: pytest.CaptureFixture[str
     assert "by laplace intervals are too narrow" in page.read_text()
 
 
-def test_a_mistake_gets_one_line(
-    files: Path, capsys: pytest.CaptureFixture[str], monkeypatch
-) -> None:
+def test_a_mistake_gets_one_line(files, capsys, monkeypatch) -> None:
     monkeypatch.chdir(files)
     (files / "other").mkdir()
     pb.save(make_calibration(count=60), files / "other" / "laplace.nc")

@@ -18,6 +18,7 @@ from polar_bayes.capture.plausibility import fresnel
 from polar_bayes.cli import main
 
 CASES = Path(__file__).parents[1] / "cases"
+pytestmark = pytest.mark.usefixtures("without_comparisons")
 
 BARE = """
 setup = "goniometer"

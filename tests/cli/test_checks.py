@@ -12,12 +12,10 @@ from polar_bayes.cli.captures import SCALES
 from polar_bayes.importers.mirror import ANGLE_IS
 
 
-def test_calibrate_prints_a_table_and_writes_every_fit(
-    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_calibrate_prints_a_table_and_writes_every_fit(plate, plate_scene, tmp_path, capsys):
     out = tmp_path / "sbc.nc"
     words = ["calibrate", str(plate), "--simulations", "20", "--method", "laplace"]
-    words += ["--scene", "picture"]  # three parameters, not eleven: it compiles in seconds
+    words += ["--scene", plate_scene]
     status = main([*words, "--out", str(out)])
     header, *rows = capsys.readouterr().out.splitlines()
     assert header.split()[:3] == ["answered", "failed", "p_value"]
@@ -49,10 +47,8 @@ def test_calibrate_prints_a_table_and_writes_every_fit(
     assert "nothing is left to resume; give another --out" in capsys.readouterr().err
 
 
-def test_identify_says_what_is_told_and_where_to_look(
-    plate: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["identify", str(plate), "--next-views", "2", "--scene", "picture"]
+def test_identify_says_what_is_told_and_where_to_look(plate, plate_scene, capsys) -> None:
+    words = ["identify", str(plate), "--next-views", "2", "--scene", plate_scene]
     assert main([*words, "--criterion", "refractive_index", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert 0.0 < told["parameters"]["refractive_index"]["prior_share"] < 0.5
@@ -80,9 +76,7 @@ def test_identify_follows_a_profile(plate: Path, capsys: pytest.CaptureFixture[s
     )
 
 
-def test_a_standard_uncertainty_that_is_no_number_is_named(
-    plate: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_standard_uncertainty_that_is_no_number_is_named(plate, capsys) -> None:
     assert main(["budget", str(plate), "--known", "tone_curve=0.1", "--known", "lamp=far"]) == 1
     said = capsys.readouterr().err
     assert said == "--known lamp=far: it is no number; write it as --known light_zenith=0.2\n"

@@ -10,6 +10,8 @@ import polar_bayes as pb
 from polar_bayes.cli import main
 from polar_bayes.methods import method
 
+pytestmark = pytest.mark.usefixtures("without_comparisons")
+
 
 def test_simulate_writes_what_fit_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "leaf.nc"
@@ -21,9 +23,7 @@ def test_simulate_writes_what_fit_reads(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 @pytest.mark.thorough
-def test_the_table_has_a_row_per_parameter(
-    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_table_has_a_row_per_parameter(plate, tmp_path, capsys) -> None:
     out = tmp_path / "fit.nc"
     assert main(["fit", str(plate), "--method", "laplace", "--out", str(out)]) == 0
     table, meanings = capsys.readouterr().out.split("\n\n")
@@ -38,19 +38,17 @@ def test_the_table_has_a_row_per_parameter(
 
 
 def test_a_fit_whose_diagnostics_fail_is_written_and_exits_with_2(
-    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
+    plate: Path, plate_scene: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
 ) -> None:
     short = pb.methods.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
     monkeypatch.setattr(method, "make_method", lambda name: short)
     out = tmp_path / "fit.nc"
-    assert main(["fit", str(plate), "--scene", "picture", "--out", str(out)]) == 2
+    assert main(["fit", str(plate), "--scene", plate_scene, "--out", str(out)]) == 2
     assert "problem: " in capsys.readouterr().err
     assert out.exists()
 
 
-def test_a_table_of_readings_becomes_a_capture(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_table_of_readings_becomes_a_capture(tmp_path, capsys) -> None:
     table, out = tmp_path / "leaf.csv", tmp_path / "leaf.nc"
     table.write_text("theta,dop,time\n10,.02,7\n20,.04,8\n")
     words = ["import", "table", str(table), "--column", "view_zenith", "theta", "--out", str(out)]
@@ -71,9 +69,7 @@ def test_a_table_of_readings_becomes_a_capture(
 
 
 @pytest.mark.thorough
-def test_the_command_line_says_what_python_can(
-    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_line_says_what_python_can(plate, tmp_path, capsys) -> None:
     """Priors, links and settings by call; a scene file of the result; both recorded."""
     out, again, file = (tmp_path / name for name in ("fit.nc", "again.nc", "plate.toml"))
     words = ["fit", str(plate), "--prior", "angle_zero=Normal(0,3)", "--method", "Point(starts=4)"]
@@ -96,9 +92,7 @@ def test_the_command_line_says_what_python_can(
     assert float(capture["view_zenith"].max()) == 85.0  # the file says what a fit uses: 78
 
 
-def test_a_fit_says_what_it_chose_and_what_is_unlikely(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_fit_says_what_it_chose_and_what_is_unlikely(tmp_path, capsys) -> None:
     """On the error stream; a capture whose q has the wrong sign is cautioned at every door."""
     table, capture, out = tmp_path / "t.csv", tmp_path / "t.nc", str(tmp_path / "fit.nc")
     rows = [f"{angle},{-q},.01" for angle, q in ((30, 0.3), (40, 0.5), (50, 0.9), (60, 0.95))]
@@ -119,9 +113,7 @@ def test_a_fit_says_what_it_chose_and_what_is_unlikely(
     assert pb.inference.choice_sentences(pb.load(out))[0] in told.err
 
 
-def test_combine_puts_captures_side_by_side(
-    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_combine_puts_captures_side_by_side(plate, tmp_path, capsys) -> None:
     """Labels are the captures' names; those of one name are numbered."""
     other, both = tmp_path / "other.nc", tmp_path / "both.nc"
     pb.save_capture(pb.load_capture(plate).isel(view=slice(12)).assign_attrs(name="thin"), other)
@@ -182,9 +174,7 @@ WRONG = {
 
 
 @each("mistake", WRONG)
-def test_a_mistake_gets_one_line_and_exit_status_1(
-    mistake: str, plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
-) -> None:
+def test_a_mistake_gets_one_line_and_exit_status_1(mistake, plate, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     places = {"PLATE": str(plate), "OUT": str(tmp_path / "out.nc")}
     assert main([places.get(word, word) for word in mistake.split()]) == 1
@@ -195,18 +185,14 @@ def test_a_mistake_gets_one_line_and_exit_status_1(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_truncated_capture_gets_one_line(
-    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_truncated_capture_gets_one_line(plate, tmp_path, capsys) -> None:
     broken = tmp_path / "broken.nc"
     broken.write_bytes(plate.read_bytes()[:2000])
     assert main(["fit", str(broken), "--out", str(tmp_path / "fit.nc")]) == 1
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_an_interrupt_ends_with_one_word(
-    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
-) -> None:
+def test_an_interrupt_ends_with_one_word(plate, tmp_path, capsys, monkeypatch) -> None:
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 

@@ -49,9 +49,7 @@ def test_new_folders_are_for_the_user_alone(base: Path, capsys) -> None:
 @pytest.mark.parametrize(
     ("part", "mode"), [("", 0o777), ("polar_bayes", 0o770), ("polar_bayes/compiled", 0o1777)]
 )
-def test_a_folder_that_others_can_write_to_is_not_used(
-    base: Path, capsys, part: str, mode: int
-) -> None:
+def test_a_folder_that_others_can_write_to_is_not_used(base, capsys, part, mode) -> None:
     compiled = base / "polar_bayes" / "compiled"
     compiled.mkdir(parents=True, mode=0o700)
     (base / part).chmod(mode)

@@ -1,7 +1,6 @@
 """The ledger of effects, printed, written, and kept by a fit."""
 
 import json
-from pathlib import Path
 
 import pytest
 import xarray as xr
@@ -19,9 +18,7 @@ instrument = "Instrument((AngleZero(), BeamOverlap()))"
 """A plate with two effects, which is quick to compile."""
 
 
-def test_effects_prints_the_ledger_and_writes_it(
-    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_effects_prints_the_ledger_and_writes_it(plate, tmp_path, capsys) -> None:
     scene, out = tmp_path / "plate.toml", tmp_path / "ledger.nc"
     scene.write_text(FEW)
     words = ["effects", str(plate), "--scene", str(scene), "--keep", "BeamOverlap"]
@@ -37,9 +34,7 @@ def test_effects_prints_the_ledger_and_writes_it(
 
 
 @pytest.mark.thorough
-def test_effects_as_json_are_what_a_fit_of_the_chosen_scene_keeps(
-    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_effects_as_json_are_what_a_fit_of_the_chosen_scene_keeps(plate, tmp_path, capsys) -> None:
     assert main(["effects", str(plate), "--tolerance", "0.2", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["tolerance"] == 0.2

@@ -31,9 +31,7 @@ def imported(frame: Path, out: Path, *words: str) -> Path:
     return out
 
 
-def test_light_from_the_surface_is_s_and_light_from_below_is_p(
-    frame: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_light_from_the_surface_is_s_and_light_from_below_is_p(frame, tmp_path, capsys) -> None:
     """Fresnel's laws, seen by the camera: no model is fitted. Errors are below .01."""
     capture = pb.load_capture(imported(frame, tmp_path / "f.nc", "--bin", "16", "--window", "1"))
     assert "outside" in capsys.readouterr().out
@@ -62,9 +60,7 @@ def test_the_highlights_say_that_the_lamp_itself_is_polarized(frame: Path, tmp_p
 
 
 @pytest.mark.thorough
-def test_the_map_of_the_fruit_separates_surface_from_body(
-    frame: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_map_of_the_fruit_separates_surface_from_body(frame, tmp_path, capsys) -> None:
     """From file to map to report by commands; every region on its side of every other kind."""
     capture = imported(frame, tmp_path / "f.nc", "--bin", "32", "--window", "2")
     store = tmp_path / "f.zarr"

@@ -91,9 +91,7 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc to see h
 
 @linux
 @each("number", BOTH)
-def test_a_signal_ends_a_fit_that_imports_or_compiles(
-    plate: Path, tmp_path: Path, number: int
-) -> None:
+def test_a_signal_ends_a_fit_that_imports_or_compiles(plate, tmp_path, number) -> None:
     process = command(["fit", str(plate), "--out", "fit.nc"], tmp_path)
     time.sleep(0.0 if number == signal.SIGINT else 4.0)
     assert stopped(process, number) == "polar-bayes: stopped\n"
@@ -210,9 +208,7 @@ def hanging(limit: float) -> str:
 
 @pytest.mark.thorough
 @each("number", BOTH)
-def test_a_second_signal_ends_at_once_what_hangs_while_it_cleans_up(
-    tmp_path: Path, number: int
-) -> None:
+def test_a_second_signal_ends_at_once_what_hangs_while_it_cleans_up(tmp_path, number) -> None:
     process = script(hanging(600.0), tmp_path)
     process.send_signal(signal.SIGTERM)
     assert process.stdout is not None
@@ -268,9 +264,7 @@ def test_what_the_command_returns_or_raises_is_passed_on_and_handlers_are_put_ba
 
 
 @pytest.mark.thorough
-def test_an_interrupt_ends_the_process_of_a_trial(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupt_ends_the_process_of_a_trial(tmp_path, monkeypatch) -> None:
     children: list[subprocess.Popen] = []
 
     class Sleeping(subprocess.Popen):

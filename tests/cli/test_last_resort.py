@@ -43,13 +43,7 @@ ERRORS = {
 
 @each("name", ERRORS)
 @each("traced", ["", "1"])
-def test_an_error_that_no_command_expects_is_one_line(
-    name: str,
-    traced: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_error_that_no_command_expects_is_one_line(name, traced, tmp_path, capsys, monkeypatch):
     error, says = ERRORS[name]
 
     def simulate(*_: object, **__: object) -> None:
@@ -138,9 +132,7 @@ def test_libraries_say_nothing_and_damaged_compiled_programs_are_one_line(tmp_pa
     assert "'jit_b'" in loud
 
 
-def test_a_command_that_python_calls_leaves_logs_warnings_and_environment_alone(
-    tmp_path: Path,
-) -> None:
+def test_a_command_that_python_calls_leaves_logs_warnings_and_environment_alone(tmp_path) -> None:
     done = python(
         """
         import logging, os, warnings

@@ -59,9 +59,7 @@ def test_a_map_has_a_page(
         (["map.zarr", "--truth", "leaf.zarr", "--uncorrected", "map.zarr"], "corrected as well"),
     ],
 )
-def test_a_mistake_gets_one_line(
-    files: Path, options: list[str], says: str, capsys: pytest.CaptureFixture[str], monkeypatch
-) -> None:
+def test_a_mistake_gets_one_line(files, options, says, capsys, monkeypatch) -> None:
     monkeypatch.chdir(files)
     assert main(["report", *options, "--out", "report"]) == 1
     told = capsys.readouterr()
@@ -70,9 +68,7 @@ def test_a_mistake_gets_one_line(
     assert not (files / "report").exists()
 
 
-def test_a_finished_map_is_resumed_with_status_0(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_finished_map_is_resumed_with_status_0(tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.setattr(store, "fit_block", lambda block, plan: blank(block, plan).load())
     capture, out = tmp_path / "plates.zarr", tmp_path / "map.zarr"
     plate_image(3, 4).to_zarr(capture, consolidated=False)
@@ -87,9 +83,7 @@ def test_a_finished_map_is_resumed_with_status_0(
     assert "it was begun with another capture or other settings" in capsys.readouterr().err
 
 
-def test_what_an_image_shares_is_told_with_its_interval(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_an_image_shares_is_told_with_its_interval(tmp_path, capsys) -> None:
     plate_image(3, 4).to_zarr(tmp_path / "plates.zarr", consolidated=False)
     words = ["map", str(tmp_path / "plates.zarr"), "--out", str(tmp_path / "map.zarr")]
     assert main([*words, "--scene", "goniometer", "--share", "roughness"]) == 1

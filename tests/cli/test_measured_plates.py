@@ -1,7 +1,6 @@
 """Two real plates, from what the laboratory wrote down to an interval and a page."""
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -24,9 +23,7 @@ PLATES = {
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("plate", ["glass", "plexiglas"])
-def test_a_measured_plate_from_table_to_interval(
-    plate: str, measured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_measured_plate_from_table_to_interval(plate, measured, tmp_path, capsys) -> None:
     """One and the same setting for both plates, as the commands' defaults have it."""
     files, columns, index = PLATES[plate]
     files = [str(measured / word) if "/" in word else word for word in files]

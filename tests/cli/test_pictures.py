@@ -33,9 +33,7 @@ def files(raw: np.ndarray, tmp_path: Path) -> list[str]:
     return words
 
 
-def test_frames_behind_a_polarizer(
-    files: list[str], raw: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_frames_behind_a_polarizer(files, raw, tmp_path, capsys) -> None:
     out = tmp_path / "ball.nc"
     noise = ["--gain", "0.2", "--read-noise", "2", "--relative-error", "0", "--dark-level", "1"]
     words = [*files, *SPHERE, *LIGHT, *FULL, *noise, "--bin", "2", "--window", "1"]

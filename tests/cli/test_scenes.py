@@ -21,6 +21,7 @@ def one_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(comparison, "MAX_ALTERNATIVES", 0)
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_a_report_says_what_it_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stages: list[str] = []
 
@@ -35,9 +36,7 @@ def test_a_report_says_what_it_does(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert stages == ["reading the result", "drawing the report"]
 
 
-def test_scenes_are_compared_and_what_remains_is_written(
-    plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_scenes_are_compared_and_what_remains_is_written(plate, tmp_path, capsys) -> None:
     out = tmp_path / "fit.nc"
     words = ["scenes", str(plate), "--method", "laplace", "--json", "--out", str(out)]
     assert main(words) in (0, 2)

@@ -150,9 +150,7 @@ def test_a_bad_fit_is_told_in_the_words_of_the_command_line(
         assert "outliers" in told["checked"]
 
 
-def test_a_good_fit_tells_what_was_checked(
-    plate: Path, tmp_path: Path, capsys, monkeypatch
-) -> None:
+def test_a_good_fit_tells_what_was_checked(plate, tmp_path, capsys, monkeypatch) -> None:
     result = make_result(wavelengths=(), views=20, draws=150, variables=("dop",))
     monkeypatch.setattr(pb, "fit", lambda *_, **__: result)
     assert main(["fit", str(plate), "--json", "--out", str(tmp_path / "fit.nc")]) == 0

@@ -14,6 +14,7 @@ from polar_bayes.inference.batching import Status
 from polar_bayes.methods.registry import method_names
 
 LINKS = {"q": pb.links.StokesLink()}
+pytestmark = pytest.mark.usefixtures("without_comparisons")
 METHODS = {
     "laplace": pb.methods.Laplace(draws=1000),
     "corrected-laplace": pb.methods.CorrectedLaplace(sampler=None),

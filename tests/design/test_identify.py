@@ -19,6 +19,7 @@ ASKED = {
     "links": LINKS,
 }
 VIEWS = np.array([30.0, 42.0, 55.0, 68.0, 74.0, 80.0])
+pytestmark = pytest.mark.usefixtures("without_comparisons")
 
 
 @pytest.fixture(scope="module")

@@ -19,6 +19,7 @@ from polar_bayes.models.per_material import per_material
 
 START = np.array([40.0, 50.0])
 GRID = np.linspace(10.0, 80.0, 8)
+pytestmark = pytest.mark.usefixtures("without_comparisons")
 
 
 def on_a_line(candidates=GRID, **asked) -> xr.Dataset:

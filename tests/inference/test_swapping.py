@@ -20,6 +20,7 @@ from polar_bayes.models.sites import declare_readings
 
 MODELS = Path(__file__).parents[2] / "models"
 FEW = pb.methods.Laplace(draws=100, chains=2)
+pytestmark = pytest.mark.usefixtures("without_comparisons")
 
 
 @pytest.fixture(scope="module")

@@ -269,6 +269,7 @@ def test_a_method_without_modes_says_that_residuals_were_not_checked() -> None:
     assert "The residuals of 2 pixels were not checked" in pb.maps.criticism_sentences(maps)[-1]
 
 
+@pytest.mark.thorough  # `test_blocks.py` compares every variable of maps that are cut otherwise
 def test_blocks_chunks_and_stores_give_the_same_flags(known: xr.Dataset, tmp_path: Path) -> None:
     image = kinds_image()
     image.to_zarr(tmp_path / "image.zarr", consolidated=False)

@@ -16,6 +16,8 @@ from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
 
+pytestmark = pytest.mark.usefixtures("without_comparisons")
+
 POINTS = 61
 HALF_WIDTH = 7.0
 """The grid spans so many Laplace standard deviations to each side, in unconstrained space."""

@@ -17,6 +17,8 @@ import polar_bayes as pb
 from polar_bayes.errors import FitError
 from polar_bayes.scenes import fit_request as fitting
 
+pytestmark = pytest.mark.usefixtures("without_comparisons")
+
 METHODS = {
     "nuts": pb.methods.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50),
     "laplace": pb.methods.Laplace(chains=2, draws=100),

@@ -14,6 +14,7 @@ from polar_bayes.inference.result import provenance_of
 from polar_bayes.setups import SETUPS
 
 PLATE = plate_capture([20.0, 35.0, 50.0, 60.0, 70.0], 0.01, seed=2)
+pytestmark = pytest.mark.usefixtures("without_comparisons")
 
 
 @pytest.fixture(scope="module")
