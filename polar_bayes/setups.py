@@ -128,7 +128,7 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
 
 
 def find_setup(name: str | Setup) -> Setup:
-    """The set-up of that name; one of a user's own is returned as it is."""
+    """Return the set-up of a name; a user's set-up is returned unchanged."""
     if isinstance(name, Setup):
         return name
     if not isinstance(name, str) or name not in SETUPS:
@@ -138,11 +138,11 @@ def find_setup(name: str | Setup) -> Setup:
 
 
 CHANNELS: Mapping[str, float] = MappingProxyType({"s": 0.0, "p": 90.0})
-"""Angle of the analyzer before each channel, degree."""
+"""Angle of the analyzer in front of the detector in each channel, degree."""
 
 
 def as_read(setup: Setup, capture: xr.Dataset) -> Setup:
-    """The set-up as a capture says that it was read: by one channel, or by polarized light."""
+    """Adapt the set-up to readings of a single channel, or with polarized light."""
     if "light_angle" in capture.get("u", xr.DataArray()).attrs:
         return _by_polarized_light(setup, float(capture["u"].attrs["light_angle"]))
     if {"dop", "q", "u"} & set(capture.data_vars) or "intensity" not in capture:
@@ -151,7 +151,7 @@ def as_read(setup: Setup, capture: xr.Dataset) -> Setup:
 
 
 def _by_polarized_light(setup: Setup, angle: float) -> Setup:
-    """The light of an ellipsometer, of which u tells the phase between s and p."""
+    """Add an ellipsometer's polarized light, by which u depends on the phase of s and p."""
     surface = setup.scene.surface
     if not isinstance(surface, SmoothSurface) or "q" not in setup.links:
         return setup
@@ -162,7 +162,7 @@ def _by_polarized_light(setup: Setup, angle: float) -> Setup:
 
 
 def _of_one_channel(setup: Setup, capture: xr.Dataset) -> Setup:
-    """The analyzer of a channel is part of the scene, its gain is part of the exposure."""
+    """Add the channel's analyzer to the scene; the exposure includes its gain."""
     scene, angle = setup.scene, CHANNELS.get(str(capture["intensity"].attrs.get("channel")))
     scene = scene.without(ChannelGain) if scene.has(ChannelGain) else scene
     if angle is not None and not scene.has(Analyzer):
@@ -173,7 +173,7 @@ def _of_one_channel(setup: Setup, capture: xr.Dataset) -> Setup:
 
 
 def setup_name(setup: Setup) -> str:
-    """The name of the set-up that has this scene, or "custom"."""
+    """Return the name of the set-up that has this scene, or "custom"."""
     scene = setup.scene.perfectly_known
     names = [name for name, own in SETUPS.items() if own.scene == scene]
     return next(
@@ -184,7 +184,7 @@ def setup_name(setup: Setup) -> str:
 def default_priors(
     setup: Setup, capture: xr.Dataset, known: Mapping[str, float] | None = None
 ) -> dict[str, dist.Distribution]:
-    """Priors of a set-up, and those that follow from how the capture says that it was made.
+    """Return priors of a set-up, adapted to how the capture was made.
 
     The caller may say what the set-up is known to: standard uncertainties by input quantity.
     """
@@ -205,7 +205,7 @@ def _priors_known_to(
     setup: Setup,
     own: Mapping[str, dist.Distribution],
 ) -> dict[str, dist.Distribution]:
-    """Priors of what a caller, or else an attribute of a capture, says that is known."""
+    """Return priors of input quantities that the caller or the capture states."""
     every = {**PRIORS, **own}
     usual = {name: every[name] for name in setup.scene.parameters if name in every}
     names = {name.removesuffix("_offset"): name for name in usual if _is_error(usual[name])}
@@ -226,13 +226,13 @@ def _priors_known_to(
 
 
 def check_uncertainty(u: object, where: str) -> None:
-    """Raise FitError where a value is no standard uncertainty."""
+    """Raise FitError unless a value is a standard uncertainty."""
     if not isinstance(u, Real) or isinstance(u, bool) or not 0.0 < float(u) < math.inf:
         raise FitError(f"it is {u!r}", where=where, hint="give a number above 0")
 
 
 def _is_error(prior: dist.Distribution) -> bool:
-    """Whether a prior is that of something which is zero in a perfect set-up."""
+    """Return whether a prior is that of an error, which is zero in a perfect set-up."""
     is_centered = isinstance(prior, dist.Normal) and np.ndim(prior.loc) == 0 and prior.loc == 0.0
     return is_centered or isinstance(prior, dist.HalfNormal)
 
@@ -242,7 +242,7 @@ def prior_table(
     *,
     priors: Mapping[str, dist.Distribution] | None = None,
 ) -> pd.DataFrame:
-    """The priors as a table.
+    """Return the priors as a table.
 
     Args:
         scene: A set-up or its name, whose links' noise is listed too, or a scene; by default every

@@ -78,7 +78,7 @@ def proxy_scores(
     results: Sequence[xr.DataTree],
     proxies: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
 ) -> pd.DataFrame:
-    """Position of the proxy of every parameter in its posterior, fit by fit.
+    """Return the quantile of each parameter's proxy in its posterior, fit by fit.
 
     Args:
         results: Trees of `polar_bayes.fit`.
@@ -119,7 +119,7 @@ def proxy_coverage(
     results: Sequence[xr.DataTree],
     proxies: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
 ) -> pd.DataFrame:
-    """How often the intervals of fits of real captures hold a proxy of the truth.
+    """Return how often intervals of fits of real captures contain a proxy of the truth.
 
     A proxy, such as the index in a data sheet, has an error of its own that these numbers do not
     include: where it is as large as the intervals, coverage is below the nominal one.

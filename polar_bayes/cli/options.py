@@ -22,12 +22,12 @@ type Context = click.Context | None
 
 
 def _flag(param: Param) -> str:
-    """An option or argument as errors name it."""
+    """Format an option or argument as errors name it."""
     return param.opts[0] if param is not None else "value"
 
 
 class Name(click.ParamType):
-    """A key of a registry of the package, which is not imported for this check."""
+    """Option type: a key of a registry, which is not imported for the check."""
 
     name = "text"
 
@@ -43,7 +43,7 @@ class Name(click.ParamType):
 
 
 class Settings(Name):
-    """The same, or settings such as `Nuts(draws=2000)`, which are parsed when they are needed."""
+    """Option type: a key, or settings such as `Nuts(draws=2000)`, parsed when they are needed."""
 
     @override
     def convert(self, value: str | Path, param: Param, ctx: Context) -> str:
@@ -51,7 +51,7 @@ class Settings(Name):
 
 
 class Assignment(click.ParamType):
-    """NAME=CALL, such as `angle_zero=Normal(0,3)`; the name may be left out where one is enough."""
+    """Option type: NAME=CALL, such as `angle_zero=Normal(0,3)`; some options make NAME optional."""
 
     name = "text"
 
@@ -79,7 +79,7 @@ STUDY_METHOD = Name("method", (*STUDIED, "nuts short", "nuts long"), FitError)
 
 
 class Input(click.ParamType):
-    """Path of a file or folder that is read; `check` refuses one that does not exist."""
+    """Option type: path of a file or folder to read; `check` refuses one that does not exist."""
 
     name = "path"
 
@@ -91,14 +91,14 @@ class Input(click.ParamType):
         return as_path(value, _flag(param)) if self.is_path else str(value)
 
     def check(self, path: Path) -> None:
-        """Refuse a path that does not exist, unless it may be the name of a column."""
+        """Refuse a path that does not exist, unless it can be the name of a column."""
         if self.is_path and not path.exists():
             what = "store" if path.suffix == ".zarr" else "file"
             raise CaptureError(f"there is no such {what}", where=str(path), hint="check the path")
 
 
 class NamedInput(Input):
-    """A name that the package knows, or the path of a file that is read in its place."""
+    """Option type: a name that the package knows, or the path of a file to read instead."""
 
     def __init__(self, names: tuple[str, ...], suffix: str, otherwise: str) -> None:
         super().__init__()
@@ -116,7 +116,7 @@ class NamedInput(Input):
 
 
 class Output(click.ParamType):
-    """Path of an output; it is checked when all inputs are known."""
+    """Option type: path of an output, which is checked when all inputs are known."""
 
     # A folder or store has no `kind`; the function that writes it checks the rest.
 
@@ -169,7 +169,7 @@ class Command(click.Command):
 
 
 def _paths(value: object, kind: Input) -> Iterator[Path]:
-    """Every path in the value of an option that may be given several times."""
+    """Yield every path in the value of an option, which may be given several times."""
     if isinstance(value, Path) or (isinstance(value, str) and not isinstance(kind, NamedInput)):
         yield Path(value)
     elif isinstance(value, tuple):
@@ -179,7 +179,7 @@ def _paths(value: object, kind: Input) -> Iterator[Path]:
 
 command = functools.partial(click.command, cls=Command)
 option = functools.partial(click.option, show_default=True)
-"""An option that states its default, where it has one."""
+"""Declare an option whose help states its default, if it has one."""
 
 capture_argument = click.argument("capture", type=INPUT)
 model_option = option("--model", type=MODEL, default="per_material")
@@ -198,7 +198,7 @@ link_option = option(
 def _standard_uncertainties(
     ctx: Context, param: Param, value: tuple[tuple[str, str], ...]
 ) -> dict[str, float]:
-    """NAME=NUMBER, given several times, as a mapping."""
+    """Return a mapping from NAME=NUMBER, given several times."""
     found = {}
     for name, text in value:
         try:
@@ -220,14 +220,14 @@ view_limit_option = option(
 
 
 def all_of(*options: Callable) -> Callable:
-    """Several options as one decorator."""
+    """Combine several options into one decorator."""
     return lambda function: functools.reduce(
         lambda inner, each: each(inner), options[::-1], function
     )
 
 
 scene_options = all_of(scene_option, prior_option, link_option, view_limit_option)
-"""The options of every command that fits a scene."""
+"""Options of every command that fits a scene."""
 
 
 NUTS_OPTIONS = {
@@ -244,11 +244,11 @@ nuts_options = all_of(
         for name, (kind, words) in NUTS_OPTIONS.items()
     )
 )
-"""What messages recommend where chains have not converged."""
+"""Options of NUTS that messages recommend where chains have not converged."""
 
 
 def with_nuts_options(settings: dict[str, Any]) -> dict[str, Any]:
-    """The settings of a fit, with those of its sampler in the method."""
+    """Return the settings of a fit with those of its sampler inside the method."""
     given = {name: settings.pop(name) for name in NUTS_OPTIONS}
     given = {name: value for name, value in given.items() if value is not None}
     if given:
@@ -268,7 +268,7 @@ json_option = option("--json", "as_json", is_flag=True, help="Print the tables a
 
 
 def out_option(kind: Output, help_text: str, **settings: Any) -> Any:
-    """The option --out, required unless it has a default."""
+    """Declare the option --out, required unless it has a default."""
     return option("--out", type=kind, help=help_text, **{"required": True, **settings})
 
 
@@ -276,7 +276,7 @@ def out_option(kind: Output, help_text: str, **settings: Any) -> Any:
 
 
 def read_scene_options(settings: dict[str, Any]) -> dict[str, Any]:
-    """The options of a command, with what they and a scene file state as values.
+    """Return the options of a command, with texts and scene files replaced by values.
 
     What is given on the command line counts more than what the file says.
     """

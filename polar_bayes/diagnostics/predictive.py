@@ -26,7 +26,7 @@ from polar_bayes.numerics.psis import MAX_PARETO_K, smooth
 
 PROBABILITIES = (0.5, 0.8, 0.95)
 COMPARABLE = MappingProxyType({"valid": True, "saturated": False})
-"""Flags of readings that can be compared with a prediction."""
+"""Flags of readings that are compared with predictions."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -42,13 +42,13 @@ class Loo:
 
     @property
     def unreliable(self) -> int:
-        """How many readings have a Pareto k above 0.7."""
+        """Number of readings with a Pareto k above 0.7."""
         return int(np.sum(~(self.pareto_k <= MAX_PARETO_K)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PredictiveCheck:
-    """How one recorded variable compares with its prediction."""
+    """Comparison of one recorded variable with its prediction."""
 
     name: str
     count: int
@@ -60,7 +60,7 @@ class PredictiveCheck:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PitBand:
-    """Empirical distribution of PIT values minus the uniform, with a simultaneous band."""
+    """Empirical distribution of PIT values minus the uniform, with its simultaneous band."""
 
     at: np.ndarray
     difference: np.ndarray
@@ -76,7 +76,7 @@ def predictive_checks(fit: FitView) -> dict[str, PredictiveCheck]:
 
 
 def pit_band(pit: np.ndarray, most: int = 500) -> PitBand | None:
-    """Simultaneous band of the empirical distribution of PIT values; None for fewer than two."""
+    """Return the simultaneous band of PIT values; None for fewer than two."""
     pit = pit[np.isfinite(pit)]
     if pit.size < 2:
         return None
@@ -90,7 +90,7 @@ def pit_band(pit: np.ndarray, most: int = 500) -> PitBand | None:
 
 @functools.lru_cache(maxsize=64)
 def _uniform_band(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points and edges of the band, which depend on the number of values only."""
+    """Return points and edges of the band, which depend on the number of values only."""
     values, random = np.linspace(0.0, 1.0, size), np.random.default_rng(214)
     at, _, lower, upper = ecdf_pit(values, ci_prob=0.95, n_simulations=1000, rng=random)
     return at, lower, upper
@@ -99,7 +99,7 @@ def _uniform_band(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def usable_readings(
     result: xr.DataTree, name: str, flags: Mapping[str, bool] = COMPARABLE
 ) -> np.ndarray:
-    """Which readings of a variable are finite and have these flags."""
+    """Return True for readings of a variable that are finite and have these flags."""
     observed = result["observed_data"].to_dataset()[name]
     usable = np.isfinite(observed.to_numpy())
     constants = result["constant_data"].to_dataset() if "constant_data" in result.children else {}
@@ -111,7 +111,7 @@ def usable_readings(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FlatVariable:
-    """One variable with its readings flattened into one axis."""
+    """One variable, its readings flattened into one axis."""
 
     name: str
     usable: np.ndarray  # bool, in the shape of the readings
@@ -142,7 +142,7 @@ def _select(result: xr.DataTree, name: str) -> FlatVariable | None:
 
 @once
 def flat_variables(fit: FitView) -> list[FlatVariable]:
-    """The recorded variables that a fit predicts and that have readings."""
+    """Return the recorded variables that have readings and predictions."""
     result = fit.result
     names = result["observed_data"].data_vars if "observed_data" in result.children else ()
     found = (_select(result, str(name)) for name in names)
@@ -165,7 +165,7 @@ def _check(
 
 
 def _pit(variable: FlatVariable, weights: np.ndarray) -> np.ndarray:
-    """Weighted share of the predicted readings below each reading, ties broken at random."""
+    """Return the weighted share of predictions below each reading, ties broken at random."""
     weights = np.where(variable.predicted < variable.full_scale, weights, 0.0)
     below = np.sum(weights * (variable.predicted < variable.observed), axis=0)
     tied = np.sum(weights * (variable.predicted == variable.observed), axis=0)
@@ -199,7 +199,7 @@ def _loo(variable: FlatVariable, relative_ess: float, correction: np.ndarray | N
 
 
 def _relative_ess(fit: FitView) -> float:
-    """Effective over actual draws, averaged over the parameters; 1 for independent draws."""
+    """Return effective over actual draws, averaged over parameters; 1 if independent."""
     if fit.method != "nuts":
         return 1.0
     draws = np.stack([s.draws for s in fit.scalars])
@@ -210,7 +210,7 @@ def _relative_ess(fit: FitView) -> float:
 
 
 def _correction(fit: FitView) -> np.ndarray | None:
-    """Log weights that turn draws of an approximation into posterior draws, where stored."""
+    """Return log weights that turn draws of an approximation into posterior draws."""
     if "log_weight" not in fit.stats or fit.method not in APPROXIMATIONS:
         return None
     log_weight = fit.stats["log_weight"].to_numpy().astype(float).ravel()

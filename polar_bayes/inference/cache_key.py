@@ -1,4 +1,4 @@
-"""What requests have in common whose compiled programs are the same: their key in a cache."""
+"""Cache keys of compiled programs: requests with equal keys share their programs."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -19,7 +19,7 @@ def cache_key(
     links: Mapping[str, AbstractLink],
     *further: object,
 ) -> str:
-    """A text that is equal for requests whose compiled programs are the same."""
+    """Return a text that is equal for requests with the same compiled programs."""
     # Not the priors themselves: distributions store what they have computed.
     stated = [
         (name, jax.tree.leaves(prior), str(jax.tree.structure(prior)))
@@ -31,5 +31,5 @@ def cache_key(
 
 
 def layout_of(data: Observations) -> tuple[str, ...]:
-    """What programs depend on in a capture: variables, axes, lengths and types, not readings."""
+    """Return what programs depend on in a capture: variables, axes, lengths and types."""
     return (str(jax.tree.structure(data)), *(f"{x.dtype}{x.shape}" for x in jax.tree.leaves(data)))

@@ -1,4 +1,4 @@
-"""A model compiled for a layout: its programs, for one capture or many side by side.
+"""A model compiled for a layout: programs for one capture, or for many in a batch.
 
 Programs of batches are made by functions `make(compiled_model, settings)` in the file of their
 algorithm. A model compiles each once and keeps it, so all captures of a layout share the programs.
@@ -29,31 +29,31 @@ from polar_bayes.numerics.compile import TRACING_LOCK, JitOnce, LRUCache
 from polar_bayes.observation.data import Observations
 
 BATCH = 128
-"""Captures that one call of a program takes."""
+"""Captures of one call of a program."""
 
 SMALL_BATCH = 4
-"""The same where each has particles of its own."""
+"""Captures of one call of a program in which each capture has its own particles."""
 
 DRAW_BATCH = 64
-"""Draws of one capture that are evaluated together: more are shared among cores that then wait for
-each other."""
+"""Draws of one capture that are evaluated together: larger batches are split among cores, which
+then wait for each other."""
 
 MAX_LAYOUTS = 16
-"""Models by layout that stay compiled: all candidates of a comparison of scenes, and some more."""
+"""Models, by layout, that the cache holds: all candidates of a comparison of scenes and more."""
 
 MAX_PROGRAMS = 64
-"""Programs that methods have made of one of them, by settings, that stay compiled."""
+"""Programs of one model, by method and settings, that the cache holds."""
 
 _THREADS = ThreadPoolExecutor(os.cpu_count() or 1, "polar_bayes batches")
-"""That run batches of all images at once: a core is not shared by two."""
+"""Threads that run the batches of all images, so that batches do not compete for a core."""
 
 MOMENTS = 4000
-"""Draws by which the moments of priors are found."""
+"""Number of draws that determine the moments of priors."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CompiledModel:
-    """What fits of one model to captures of one layout have in common.
+    """The programs that fits of one model to captures of one layout share.
 
     `program` is the model in the precision of the fit; `layout` is a capture of that layout.
     """
@@ -73,12 +73,12 @@ class CompiledModel:
             return make_initializer(self.model, self.program, self.layout)
 
     def free(self, data: Observations) -> Observations:
-        """A capture with room for what is held; not one of groups that are fitted apart first."""
+        """Return a capture with NaN for parameters that may be held; unchanged if it has groups."""
         return data if data.leading else self.program.free(data)
 
     @functools.cached_property
     def single_program(self) -> Program:
-        """The same model in single precision."""
+        """Program of the model in single precision."""
         if self.precision == "single":
             return self.program
         with jax.enable_x64(False), TRACING_LOCK:
@@ -90,7 +90,7 @@ class CompiledModel:
         return np.float64 if self.precision == "double" else np.float32
 
     def made[S: Hashable, P](self, make: Callable[["CompiledModel", S], P], settings: S) -> P:
-        """What a method makes of the model for its settings, a program say, at its first use."""
+        """Return what a method makes of the model, such as a program, from the cache."""
         return self._made.of((make, settings), lambda: make(self, settings))
 
     def run[S: Hashable](
@@ -126,7 +126,7 @@ class CompiledModel:
         given: tuple = (),
         single: bool = False,
     ) -> None:
-        """Begin to compile what `run` needs, in parallel with what follows, given one state."""
+        """Begin to compile the program of `run` in another thread, for one state."""
         program = self.made(make, settings)
         if not program.is_begun:
             with self._arguments(pixels, states, given, BATCH, single=single) as arguments:
@@ -136,7 +136,7 @@ class CompiledModel:
     def _arguments(
         self, pixels: ObservationBatch, states: tuple, given: tuple, batch: int, *, single: bool
     ) -> Iterator[Callable[[np.ndarray], tuple]]:
-        """The arguments of a program for the pixels of a batch, in its precision."""
+        """Yield a function that returns a program's arguments for pixels of a batch."""
         dtype = np.float32 if single else self.dtype
         with jax.enable_x64(dtype == np.float64):
             pixels = pixels.in_precision(dtype)
@@ -151,7 +151,7 @@ class CompiledModel:
 
     @functools.cached_property
     def parameter_axes(self) -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
-        """By parameter: names and lengths of the axes that it has in one pixel."""
+        """Names and lengths of each parameter's axes in one pixel, by parameter."""
         z = np.zeros(self.program.size, self.dtype)
         with jax.enable_x64(self.precision == "double"), TRACING_LOCK:
             names = jax.eval_shape(self.program.parameters, z, self.layout)
@@ -159,7 +159,7 @@ class CompiledModel:
         return {name: (tuple(dims[name]), shape_of(self.program, name)) for name in names}
 
     def prior_draws(self, count: int) -> np.ndarray:
-        """Draws from the prior, the starting points of mode searches. (draw, size)."""
+        """Return draws from the prior, at which mode searches start, (draw, size)."""
         # Moments need many, and a draw does not depend on how many there are: keys compile once.
         return self.made(_prior_draws, max(count, MOMENTS))[:count]
 
@@ -174,7 +174,7 @@ class CompiledModel:
 
     @property
     def prior_moments(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Mean and sd of every parameter before any reading, where they are finite."""
+        """Prior mean and sd of every parameter for which they are finite."""
         found = self.prior_parameters.items()
         moments = {name: (x.mean(axis=0), x.std(axis=0)) for name, x in found}
         return {name: two for name, two in moments.items() if np.isfinite(two).all()}
@@ -190,7 +190,7 @@ def _prior_draws(compiled_model: CompiledModel, count: int) -> np.ndarray:
 def evaluate_draws(
     program: Program, z: Float[Array, "draw size"], data: Observations
 ) -> tuple[dict[str, Array], Float[Array, " draw"]]:
-    """Parameters and log posterior densities of draws of one pixel; minus infinity for NaN."""
+    """Return parameters and log posterior densities of draws; minus infinity in place of NaN."""
     parameters, values = jax.lax.map(
         lambda z: program.parameters_and_potential(z, data), z, batch_size=DRAW_BATCH
     )
@@ -201,7 +201,7 @@ _COMPILED: LRUCache[CompiledModel] = LRUCache(MAX_LAYOUTS)
 
 
 def compile_model(request: Request, data: Observations) -> CompiledModel:
-    """The compiled model of a capture and of every other one of its layout, from the cache."""
+    """Return the compiled model of a capture's layout from the cache."""
     parts = request.model, request.scene, request.priors, request.links
     key = cache_key(*parts, request.precision, layout_of(data))
     return compile_layout(key, request, lambda: data)
@@ -210,7 +210,7 @@ def compile_model(request: Request, data: Observations) -> CompiledModel:
 def compile_layout(
     key: str, request: Request, observe: Callable[[], Observations]
 ) -> CompiledModel:
-    """The same where a text is known that tells layouts apart without a capture."""
+    """Return the compiled model of a layout that `key` identifies, from the cache."""
     parts = request.model, request.scene, request.priors, request.links
 
     def make() -> CompiledModel:
@@ -227,7 +227,7 @@ def compile_layout(
 
 
 def layout_key(request: Request, *further: object) -> str:
-    """A text that is the same for requests whose captures have one layout and one model."""
+    """Return a text that is equal for requests with the same model and the same layout."""
     layout = [
         (name, v.dims, v.shape, str(v.dtype)) for name, v in request.capture.variables.items()
     ]

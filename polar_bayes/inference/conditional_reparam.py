@@ -1,4 +1,4 @@
-r"""Coefficients of a linear term, standardized given all other coordinates.
+r"""Conditional standardization of the coefficients of a linear term.
 
 The weights w of a smooth discrepancy can imitate most of what the other parameters do to the
 readings. Each set of those parameters therefore has weights of its own, known to the accuracy of
@@ -38,18 +38,18 @@ from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.observation.data import Observations
 
 MOST_COEFFICIENTS = 16
-"""More than so many are left as they are: their precision is factored for every gradient."""
+"""Most coefficients to standardize: their precision is factored for every gradient."""
 
 
 STEP = 0.01
-"""Of differences, in coordinates that are about standard normal."""
+"""Step of finite differences in coordinates that are about standard normal."""
 
 SIDE_BY_SIDE = 50
-"""Vectors that are vectorized over."""
+"""Number of vectors that one vectorized call takes."""
 
 
 class ModeRegression(eqx.Module):
-    """The posterior mode, and the regression of the coefficients on the other coordinates there."""
+    """The posterior mode, and the regression of the coefficients on other coordinates there."""
 
     others: Float[Array, " other"]
     coefficients: Float[Array, " coefficient"]
@@ -57,7 +57,7 @@ class ModeRegression(eqx.Module):
 
 
 class ConditionalInputs(eqx.Module):
-    """The arguments of the potential besides the coordinates."""
+    """Arguments of the potential other than the coordinates."""
 
     point: ModeRegression
     data: Observations
@@ -65,7 +65,7 @@ class ConditionalInputs(eqx.Module):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ConditionalReparam:
-    """The map between coordinates x, in which the coefficients are standardized, and a program's.
+    """The map from coordinates x, in which coefficients are standardized, to a program's.
 
     Other coordinates are the same in both, but for two along a sum, where there are such; every
     coordinate keeps its position.
@@ -78,7 +78,7 @@ class ConditionalReparam:
     sums: SumReparam | None
 
     def potential(self, x: Float[Array, " size"], given: ConditionalInputs) -> Float[Array, ""]:
-        """Minus the log density of x, up to a constant."""
+        """Return minus the log density of x, up to a constant."""
         x, w, log_volume = self._moved(x, given)
         # Not of one flat vector: the optics, which depend on other sites only, are then found to be
         # the same as in the Gauss-Newton step, and computed once.
@@ -88,12 +88,12 @@ class ConditionalReparam:
     def forward(
         self, x: Float[Array, " size"], given: ConditionalInputs
     ) -> tuple[Float[Array, " size"], Float[Array, ""]]:
-        """Coordinates of the program, and the log volume of the map."""
+        """Return the coordinates of the program, and the log volume of the map."""
         x, w, log_volume = self._moved(x, given)
         return x.at[self.coefficients].set(w), log_volume
 
     def backward(self, z: np.ndarray, data: Observations) -> np.ndarray:
-        """Coordinates x of vectors of the program, (row, size), their coefficients standard 0."""
+        """Return coordinates x of the program's vectors (row, size), standardized ones zero."""
         if self.sums is not None:
             z = in_blocks(self.sums.backward_of_block, (z,), data)
         x = np.array(z)
@@ -102,17 +102,17 @@ class ConditionalReparam:
 
     @functools.cached_property
     def potential_jit(self) -> Callable[[Array, ConditionalInputs], Array]:
-        """The potential; the model is traced once, however many programs compute it."""
+        """The potential, traced once for all programs that compute it."""
         return jax.jit(self.potential, inline=True)
 
     @functools.cached_property
     def value_and_gradient(self) -> JitOnce:
-        """The potential with its gradient, compiled."""
+        """The compiled potential and its gradient."""
         return JitOnce(jax.value_and_grad(self.potential_jit))
 
     @functools.cached_property
     def forward_of_block(self) -> JitOnce:
-        """`forward` of many vectors, compiled."""
+        """Compiled `forward` of many vectors."""
         return JitOnce(
             lambda x, given: jax.lax.map(
                 lambda one: self.forward(one, given), x, batch_size=SIDE_BY_SIDE
@@ -122,7 +122,7 @@ class ConditionalReparam:
     def inputs(
         self, mode: np.ndarray, covariance: np.ndarray, data: Observations
     ) -> ConditionalInputs:
-        """The map around a mode of the program, with the posterior covariance there."""
+        """Return the inputs of the map around a mode, with the posterior covariance there."""
         among = covariance[np.ix_(self.others, self.others)]
         across = covariance[np.ix_(self.coefficients, self.others)]
         slope = np.linalg.solve(among, across.T).T
@@ -141,7 +141,7 @@ class ConditionalReparam:
         )
 
     def inputs_like(self, data: Observations) -> ConditionalInputs:
-        """Inputs of the shapes that `inputs` gives, for programs to be compiled."""
+        """Return inputs of the shapes that `inputs` returns, to compile programs early."""
         dtype, count = data.brightness.dtype, len(self.coefficients)
         others = jnp.zeros(len(self.others), dtype)
         slope = jnp.zeros((count, len(self.others)), dtype)
@@ -150,7 +150,7 @@ class ConditionalReparam:
     def _moved(
         self, x: Float[Array, " size"], given: ConditionalInputs
     ) -> tuple[Float[Array, " size"], Float[Array, " coefficient"], Float[Array, ""]]:
-        """Other coordinates of the program, the coefficients, and the log volume of the map."""
+        """Return other coordinates, coefficients, and the log volume of the map."""
         point, noise, volume = given.point, x[self.coefficients], jnp.zeros((), x.dtype)
         start = point.coefficients + point.slope @ (x[self.others] - point.others)
         if self.sums is not None:
@@ -165,12 +165,12 @@ class ConditionalReparam:
         start: Float[Array, " coefficient"],
         given: ConditionalInputs,
     ) -> tuple[Float[Array, " coefficient"], Float[Array, "coefficient coefficient"]]:
-        """Mean of the coefficients given the others, and Cholesky factor of their precision."""
+        """Return conditional mean and Cholesky factor of the precision of the coefficients."""
         program = self.program
         sites = program.unravel(x)
 
         def predict(w: Array) -> tuple[list[Array], Any]:
-            """Means of all readings; and these with variances, readings and the priors of w."""
+            """Return means of readings; then means, variances, readings and priors of w."""
             trace = program.trace_at(sites | self._by_name(w), given.data)
             noise = [moments(trace[name]["fn"], trace[name]["value"]) for name in program.observed]
             priors = [trace[name]["fn"] for name in self.names]
@@ -200,7 +200,7 @@ class ConditionalReparam:
 
 
 def moments(distribution: dist.Distribution, reading: Array) -> tuple[Array, Array, Array]:
-    """Mean and variance of a reading and the reading, where they are normal if anything is."""
+    """Return mean, variance and value of a reading on the scale of its base distribution."""
     while isinstance(distribution, dist.MaskedDistribution | dist.TransformedDistribution):
         if isinstance(distribution, dist.TransformedDistribution):
             for transform in reversed(distribution.transforms):
@@ -210,7 +210,7 @@ def moments(distribution: dist.Distribution, reading: Array) -> tuple[Array, Arr
 
 
 def find_coefficients(program: Program, data: Observations) -> ConditionalReparam | None:
-    """The map over vectors with a normal prior that no plate repeats; None without any."""
+    """Return the map that standardizes vectors with a normal prior; None without any."""
     positions = program.positions
     names = tuple(
         name

@@ -63,7 +63,7 @@ from polar_bayes.progress import Progress
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Groups:
-    """Positions in the flat vector of a program: of each group, (group, local), and of the rest."""
+    """Positions in the flat vector of a program: of the groups, (group, local), and of the rest."""
 
     axis: str
     local: np.ndarray
@@ -76,7 +76,7 @@ class Groups:
 
 
 def find_groups(program: Program, data: Observations) -> Groups | None:
-    """The groups along the only leading axis of a capture; None without one."""
+    """Return the groups along the only leading axis of a capture; None without one."""
     if len(data.leading) != 1:
         return None
     name, length = data.leading[0]
@@ -96,7 +96,7 @@ def find_groups(program: Program, data: Observations) -> Groups | None:
 
 
 def group_of(data: Observations, number: int) -> Observations:
-    """One group of a capture, as a capture with a leading axis of length 1."""
+    """Return one group of a capture, as a capture with a leading axis of length 1."""
     axis, length = data.dims[0]
 
     def cut(array: jax.Array) -> jax.Array:
@@ -116,7 +116,7 @@ class GroupModel:
 
 
 def find_group_model(model: Model, groups: Groups, data: Observations) -> GroupModel | None:
-    """The model of one group; None where it differs between groups, as by a prior for each."""
+    """Return the model of one group; None if groups differ, as with a prior for each."""
     first = group_of(data, 0)
     try:
         program = compile_program(model, first)
@@ -129,11 +129,11 @@ def find_group_model(model: Model, groups: Groups, data: Observations) -> GroupM
 
 
 Starts = tuple[np.ndarray, np.ndarray]
-"""Coordinates of a group, (start, local), and common ones, (start, common)."""
+"""Starting points of a group: its coordinates (start, local), common ones (start, common)."""
 
 
 class GroupProgram:
-    """The groups of one capture, each by itself."""
+    """Programs and data of the groups of one capture."""
 
     def __init__(self, group_model: GroupModel, data: Observations, threads: int = 2) -> None:
         self._program = group_model.program
@@ -149,7 +149,7 @@ class GroupProgram:
         movable: np.ndarray,
         progress: Callable[[float], None],
     ) -> list[Modes]:
-        """The modes of every group over its own coordinates and the movable common ones."""
+        """Find the modes of every group over its own coordinates and movable common ones."""
 
         def of_group(number: int) -> Modes:
             # A thread starts with the settings of the process, not with those of this fit.
@@ -169,7 +169,7 @@ class GroupProgram:
     def expand(
         self, number: int, local: np.ndarray, common: np.ndarray, sd: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Gradient, Hessian and mixed derivatives of the potential in a group's coordinates."""
+        """Return gradient, Hessian and mixed derivatives of the potential of a group."""
         potential, z = self._potential(number), self._join(local, common)
         rows = central_difference_hessian(potential, z, sd, self._dtype, self._local)
         hessian = np.nan_to_num(rows)
@@ -213,7 +213,7 @@ class GroupProgram:
 
 
 class ExpansionPoint(eqx.Module):
-    """The numbers of the map, which no program contains: moving the point compiles nothing."""
+    """Expansion point of the map, an argument of programs: moving it compiles nothing."""
 
     common: Float[Array, " common"]
     factor: Float[Array, "common common"]
@@ -224,7 +224,7 @@ class ExpansionPoint(eqx.Module):
 
 
 class ReparamInputs(eqx.Module):
-    """The arguments of the potential besides the coordinates."""
+    """Arguments of the potential other than the coordinates."""
 
     point: ExpansionPoint
     data: Observations
@@ -232,25 +232,25 @@ class ReparamInputs(eqx.Module):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class HierarchicalReparam:
-    """The map between the coordinates w and those of a program."""
+    """The map between coordinates w and those of a program."""
 
     program: Program
     groups: Groups
 
     @property
     def size(self) -> int:
-        """Length of w: common coordinates first, then one group after the other."""
+        """Length of w: common coordinates first, then each group's."""
         return self.program.size
 
     def potential(self, w: Float[Array, " size"], given: ReparamInputs) -> Float[Array, ""]:
-        """Minus the log density of w, up to a constant."""
+        """Return minus the log density of w, up to a constant."""
         z, log_volume = self.forward(w, given)
         return self.program.potential(z, given.data) - log_volume
 
     def forward(
         self, w: Float[Array, " size"], given: ReparamInputs
     ) -> tuple[Float[Array, " size"], Float[Array, ""]]:
-        """Coordinates of the program, and the log volume of the map, up to a constant."""
+        """Return the program's coordinates, and the log volume of the map up to a constant."""
         point, split = given.point, self.groups.common.size
         common = point.common + point.factor @ w[:split]
         mean, lower = self._conditional(common, given)
@@ -260,7 +260,7 @@ class HierarchicalReparam:
         return self._join(common, local), log_volume
 
     def inverse(self, z: Float[Array, " size"], given: ReparamInputs) -> Float[Array, " size"]:
-        """The coordinates w of a vector of the program."""
+        """Return the coordinates w of a vector of the program."""
         common, local = z[self.groups.common], z[self.groups.local]
         mean, lower = self._conditional(common, given)
         noise = jnp.einsum("gji,gj->gi", lower, local - mean)
@@ -273,7 +273,7 @@ class HierarchicalReparam:
         local: Float[Array, "group local"],
         data: Observations,
     ) -> tuple[Float[Array, "group local"], Float[Array, "group local"]]:
-        """Gradient and curvature of minus the log prior of the groups, given common coordinates."""
+        """Return gradient and Hessian of the groups' minus log prior, given common coordinates."""
         # The coordinates of a group are taken as independent under their prior, which affects the
         # efficiency of sampling only.
 
@@ -284,27 +284,27 @@ class HierarchicalReparam:
 
     @functools.cached_property
     def potential_jit(self) -> Callable[[Array, ReparamInputs], Array]:
-        """The potential; the model is traced once, however many programs compute it."""
+        """The potential, traced once for all programs that compute it."""
         return jax.jit(self.potential, inline=True)
 
     @functools.cached_property
     def value_and_gradient(self) -> JitOnce:
-        """The potential with its gradient, compiled."""
+        """The compiled potential and its gradient."""
         return JitOnce(jax.value_and_grad(self.potential_jit))
 
     @functools.cached_property
     def forward_jit(self) -> JitOnce:
-        """`forward` without the volume, compiled."""
+        """Compiled `forward`, without the volume."""
         return JitOnce(lambda w, given: self.forward(w, given)[0])
 
     @functools.cached_property
     def inverse_jit(self) -> JitOnce:
-        """`inverse`, compiled."""
+        """Compiled `inverse`."""
         return JitOnce(self.inverse)
 
     @functools.cached_property
     def forward_chains(self) -> JitOnce:
-        """`forward_jit` of chains of draws, (chain, draw, size), one after the other."""
+        """Apply `forward_jit` to chains of draws, (chain, draw, size), one after the other."""
 
         def chains(w: Array, given: ReparamInputs) -> Array:
             return jax.lax.map(
@@ -315,11 +315,11 @@ class HierarchicalReparam:
 
     @functools.cached_property
     def population_jit(self) -> JitOnce:
-        """`population_derivatives`, compiled."""
+        """Compiled `population_derivatives`."""
         return JitOnce(self.population_derivatives)
 
     def _group_prior(self, z: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
-        """Minus the log prior density of the coordinates of all groups."""
+        """Return minus the log prior density of the coordinates of all groups."""
         terms, _ = self.program.log_terms(z, data)
         own = [n for n in self.program.supports if self.groups.axis in self.program.dims[n]]
         return -sum((terms[name] for name in own), jnp.zeros((), z.dtype))
@@ -327,7 +327,7 @@ class HierarchicalReparam:
     def _conditional(
         self, common: Float[Array, " common"], given: ReparamInputs
     ) -> tuple[Float[Array, "group local"], Float[Array, "group local local"]]:
-        """Mean of every group, and Cholesky factor of its precision, given what is common."""
+        """Return conditional mean and Cholesky factor of the precision of every group."""
         point = given.point
         gradient, curvature = self.population_derivatives(common, point.local, given.data)
         diagonal = jnp.maximum(curvature, 0.0)[..., None] * jnp.eye(
@@ -347,16 +347,16 @@ class HierarchicalReparam:
 
 
 TYPICAL_DRAWS = 200
-"""Prior draws whose median is the first value of the common coordinates."""
+"""Number of prior draws whose median is the first guess of the common coordinates."""
 
 FEWEST_STARTS, MOST_STARTS, ALL_STARTS = 4, 16, 256
-"""Starts of each group, and of all groups together where each may have more than the fewest."""
+"""Fewest and most starts of each group; number of starts that all groups share."""
 
 MOST_ROUNDS = 4
-"""Joint optimizations, each around the end of the one before."""
+"""Largest number of joint optimizations, each expanded where the previous one ended."""
 
 WIDEST = 3.0
-"""Largest standard deviation of a common coordinate that is taken from its Hessian."""
+"""Largest standard deviation of a common coordinate along any axis of its Hessian."""
 
 
 class GroupModes(NamedTuple):
@@ -371,7 +371,7 @@ class GroupModes(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FittedReparam:
-    """The map with its expansion point."""
+    """The map and its expansion point."""
 
     reparam: HierarchicalReparam
     given: ReparamInputs
@@ -380,7 +380,7 @@ class FittedReparam:
     decrement: float
 
     def draw_starts(self, key: Array, chains: int) -> np.ndarray:
-        """Starting points in w: each group at one of its modes, drawn by weight."""
+        """Draw starting points in w: each group at one of its modes, by weight."""
         random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
         groups, dtype = self.reparam.groups, self.given.point.common.dtype
         starts = []
@@ -418,7 +418,7 @@ class _Fit:
     progress: Progress
 
     def run(self, key: Array) -> FittedReparam:
-        """Alternate between expansion and joint optimization until the mode stays in place."""
+        """Alternate expansion and joint optimization until the mode is stable."""
         groups, size, dtype = self.reparam.groups, self.reparam.size, self.dtype
         modes = self.group_modes(key)
         common, local = modes.common, np.stack([each.z[0] for each in modes.of_group])
@@ -449,7 +449,7 @@ class _Fit:
     def expand(
         self, common: np.ndarray, local: np.ndarray, factor: np.ndarray, modes: GroupModes
     ) -> tuple[ReparamInputs, ValueAndGradient]:
-        """The map around a point, from the derivatives of the readings without the population."""
+        """Expand the map around a point, from derivatives of readings without the population."""
         prior_gradient, prior_curvature = self.population(common, local)
         gradients, hessians, mixed = [], [], []
         for number, each in enumerate(modes.of_group):
@@ -466,7 +466,7 @@ class _Fit:
         return given, NumpyPotential(self.reparam.value_and_gradient, given, self.dtype)
 
     def group_modes(self, key: Array) -> GroupModes:
-        """Search each group with common coordinates of its own, then with those of all groups."""
+        """Search each group with its own common coordinates, then with those of all groups."""
         groups = self.reparam.groups
         drawn = from_prior(self.reparam.program, key, TYPICAL_DRAWS, self.data)
         starts = int(np.clip(ALL_STARTS // groups.count, FEWEST_STARTS, MOST_STARTS))
@@ -502,13 +502,13 @@ class _Fit:
         return GroupModes(common, movable, shared, starts, sum(each.failures for each in own))
 
     def population(self, common: np.ndarray, local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Gradient and curvature of minus the log prior of the groups, each (group, local)."""
+        """Return gradient and curvature of minus the groups' log prior, each (group, local)."""
         g, z = (jnp.asarray(x, self.dtype) for x in (common, local))
         gradient, curvature = self.reparam.population_jit(g, z, self.data)
         return np.asarray(gradient, float), np.asarray(curvature, float)
 
     def hyperparameters(self, z: np.ndarray) -> np.ndarray:
-        """True for common coordinates that the prior of a group depends on."""
+        """Return True for common coordinates on which the prior of a group depends."""
         common, local = z[self.reparam.groups.common], z[self.reparam.groups.local]
         before = np.stack(self.population(common, local))
         steps = 0.5 * np.eye(common.size)
@@ -517,7 +517,7 @@ class _Fit:
 
 
 def _weighted_medians(values: np.ndarray, variances: np.ndarray) -> np.ndarray:
-    """Medians of the columns, weighted by inverse variance: outliers have no effect."""
+    """Return medians of columns, weighted by inverse variance, which outliers do not affect."""
     medians = []
     for column, variance in zip(values.T, variances.T, strict=True):
         order = np.argsort(column)
@@ -529,7 +529,7 @@ def _weighted_medians(values: np.ndarray, variances: np.ndarray) -> np.ndarray:
 def _common_factor(
     potential: ValueAndGradient, w: np.ndarray, factor: np.ndarray, dtype: np.dtype
 ) -> np.ndarray:
-    """Cholesky factor of the covariance of the common coordinates, from their Hessian."""
+    """Return a Cholesky factor of the common coordinates' covariance from their Hessian."""
     size = len(factor)
     if not size:
         return factor

@@ -1,4 +1,4 @@
-"""What a caller asks to be fitted, checked and with every default filled in."""
+"""Requests: the arguments of a fit, checked and with every default filled in."""
 
 import dataclasses
 import functools
@@ -45,7 +45,7 @@ _MODEL_INFO: LRUCache[ModelInfo] = LRUCache(32)
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """A capture, a model and all that fixes its posterior, with every default filled in."""
+    """A capture, a model and everything else that determines the posterior."""
 
     capture: xr.Dataset
     model: Callable
@@ -65,11 +65,11 @@ class Request:
     """Parameters of the set-up that the pixels of an image share by default."""
 
     def bind(self, scene: Scene) -> Callable[[Observations], None]:
-        """The model with everything but its data in place."""
+        """Return the model with all its arguments except the data."""
         return bind_model(self.model, scene, self.priors, self.links)
 
     def describe(self) -> Provenance:
-        """The request in what JSON can hold, for the provenance of a result."""
+        """Describe the request in types of JSON, for the provenance of a result."""
         return {
             "model": self.model_name,
             "scene": self.scene_name,
@@ -87,7 +87,7 @@ def bind_model(
     priors: Mapping[str, dist.Distribution],
     links: Mapping[str, AbstractLink],
 ) -> Callable[[Observations], None]:
-    """A model with everything but its data in place, in the precision that is switched on."""
+    """Return the model with all arguments except the data, in the current precision."""
     own = {name: cast_prior(prior) for name, prior in priors.items()}
     return functools.partial(_run, model=model, scene=scene, priors=own, links=links)
 
@@ -99,7 +99,7 @@ def _run(
     priors: dict[str, dist.Distribution],
     links: Mapping[str, AbstractLink],
 ) -> None:
-    """The model, with priors from other pixels in the place of those that they replace."""
+    """Run the model with priors from other pixels in the place of those they replace."""
     shared = {
         name: NormalCoordinate(mean, sd, priors[name].support)
         for name, (mean, sd) in data.shared.items()
@@ -108,7 +108,7 @@ def _run(
 
 
 def is_padded(model: Callable, scene: Scene, links: Mapping[str, AbstractLink]) -> bool:
-    """Whether captures with other numbers of views may share the programs of a model."""
+    """Return whether captures with different numbers of views can share programs."""
     # Code of the user's own need not mask what is not valid, so it is given no padding.
     return not uses_own_code(model, scene, links)
 
@@ -126,7 +126,7 @@ def resolve(
     known: Mapping[str, float] | None = None,
     is_perfect: bool = False,
 ) -> Request:
-    """Check what the caller asked for, and fill in every default.
+    """Check the arguments of the caller, and fill in every default.
 
     The set-up is known to standard uncertainties, which `known` replaces, or perfectly.
     """
@@ -204,7 +204,7 @@ def _check_settings(limit: float, precision: str, seed: int) -> None:
 
 
 def _find_scene(scene: object, capture: xr.Dataset) -> tuple[Setup, str]:
-    """The set-up that a caller gives, by name or as it is, and its name."""
+    """Return the set-up of the caller, given by name or value, and its name."""
     if isinstance(scene, str):
         return find_setup(scene), scene
     if isinstance(scene, Setup):
@@ -213,12 +213,12 @@ def _find_scene(scene: object, capture: xr.Dataset) -> tuple[Setup, str]:
 
 
 def _usual_links(capture: xr.Dataset, setup: Setup) -> dict[str, AbstractLink]:
-    """The links of a set-up for the variables that a capture holds."""
+    """Return a set-up's links for the variables of a capture."""
     return {name: link for name, link in setup.links.items() if name in capture}
 
 
 def _are_same(prior: object, usual: object) -> bool:
-    """Whether a prior is the default one, as where a scene file lists every prior."""
+    """Return whether a prior equals the default, as in scene files that list every prior."""
     if not isinstance(prior, dist.Distribution) or not isinstance(usual, dist.Distribution):
         return False
     # A class of the user's own may have any name.
@@ -241,7 +241,7 @@ def _inspect(
     priors: Mapping[str, dist.Distribution] | None,
     links: Mapping[str, AbstractLink],
 ) -> ModelInfo:
-    """Sites of the model, from the cache where a capture of that layout was fitted before."""
+    """Return information on the sites of the model, cached by layout."""
     table = PriorTable(priors)
     key = cache_key(model, scene, priors or {}, links, layout_of(data))
     with TRACING_LOCK:
@@ -249,7 +249,7 @@ def _inspect(
 
 
 def _name_of(model: Callable) -> str:
-    """The name of a model of the user's own; handlers around it are part of the name."""
+    """Return the name of the user's model, including handlers around it."""
     if isinstance(model, functools.partial):
         return _name_of(model.func)
     inner = getattr(model, "fn", None) if isinstance(model, Messenger) else None
@@ -259,7 +259,7 @@ def _name_of(model: Callable) -> str:
 
 
 def _setup_around(scene: object, capture: xr.Dataset) -> Setup:
-    """A scene of the user's own, with the links and limits of the capture's set-up."""
+    """Return the user's scene with the links and limits of the capture's set-up."""
     if not isinstance(scene, Scene):
         raise FitError(
             f"a {type(scene).__name__} is not a scene",
@@ -273,7 +273,7 @@ def _setup_around(scene: object, capture: xr.Dataset) -> Setup:
 def _choose_links(
     capture: xr.Dataset, setup: Setup, links: AbstractLink | Mapping[str, AbstractLink] | None
 ) -> dict[str, AbstractLink]:
-    """The links of the variables that the capture holds."""
+    """Return links for the variables of the capture."""
     if links is None:
         chosen = _usual_links(capture, setup)
         wanted = list(setup.links)
@@ -328,7 +328,7 @@ def _check_link(name: str, link: object, capture: xr.Dataset) -> None:
 
 
 def _check_views(capture: xr.Dataset, limit: float) -> None:
-    """One view cannot separate four parameters, whatever the prior."""
+    """Refuse captures with a single view, which cannot separate four parameters."""
     data_valid = capture.get("valid", xr.DataArray(True)) & (capture["view_zenith"] <= limit)
     per_fit = data_valid.broadcast_like(capture["view_zenith"])
     used = int(per_fit.any([d for d in per_fit.dims if d != "view"]).sum())

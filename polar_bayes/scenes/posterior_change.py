@@ -46,7 +46,7 @@ from polar_bayes.progress import Progress
 
 @dataclasses.dataclass(frozen=True)
 class Compiled:
-    """A compiled program, its operations, and the time of its compilation."""
+    """A compiled program, its number of operations, and its compilation time."""
 
     call: Callable
     operations: float
@@ -66,7 +66,7 @@ def compile_and_count(function: Callable, *arguments: object) -> Compiled:
 def run_seconds(
     calls: Sequence[Callable[[], object]], *, rounds: int = 40, repeats: int = 3
 ) -> list[float]:
-    """Time of each call at its fastest, results awaited."""
+    """Return the shortest time of each call, including the wait for its result."""
 
     # The calls take turns, so that a machine that slows down slows them all alike; the fastest
     # round is the one that other programs disturbed least.
@@ -84,12 +84,12 @@ def run_seconds(
 
 
 Readings = Mapping[str, np.ndarray]
-"""One number for every reading, by variable."""
+"""Numbers for every reading, by variable."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SceneDensity:
-    """The log posterior density of one scene, compiled; labels and sites name its coordinates."""
+    """The compiled log posterior density of one scene, with labels of its coordinates."""
 
     program: Program
     data: Observations
@@ -98,19 +98,19 @@ class SceneDensity:
     sites: tuple[str, ...]
 
     def evaluate(self, z: np.ndarray) -> tuple[Array, dict[str, Array]]:
-        """The potential and the noise-free readings at an unconstrained vector."""
+        """Return potential and noise-free readings at an unconstrained vector."""
         return self.compiled.call(np.asarray(z), self.data)
 
     def potential(self, z: np.ndarray) -> float:
-        """Minus the log density of an unconstrained vector (size,), up to a constant."""
+        """Return minus the log density of an unconstrained vector (size,), up to a constant."""
         return float(self.evaluate(z)[0])
 
     def noise_free(self, z: np.ndarray) -> Readings:
-        """Predicted readings without noise."""
+        """Return predicted readings without noise."""
         return {name: np.asarray(values) for name, values in self.evaluate(z)[1].items()}
 
     def noise_sd(self, z: np.ndarray) -> Readings:
-        """Standard deviation of the noise of every reading."""
+        """Return the standard deviation of the noise of every reading."""
 
         def apply(function: Callable[[dist.Distribution], Array], names: Sequence[str]) -> Readings:
             def of_noise(z: Array, data: Observations) -> dict[str, Array]:
@@ -133,7 +133,7 @@ def _stated_sd(distribution: dist.Distribution) -> Array:
 
 
 def _quantile_sd(distribution: dist.Distribution) -> Array:
-    """Half the width of the central 68% of a thousand draws: the sd of normal noise."""
+    """Return half the width of the central 68% of draws: the sd of normal noise."""
     draws = distribution.sample(jax.random.key(0), (1000,))
     low, high = jnp.quantile(draws, jnp.asarray([0.1587, 0.8413]), axis=0)
     return 0.5 * (high - low)
@@ -160,12 +160,12 @@ def compile_density(request: Request, data: Observations) -> SceneDensity:
 
 
 FIRST_STEP, STEP = 1e-5, 1e-3
-"""Steps of differences: before the width of the posterior is known, and in units of it."""
+"""Steps of differences before the posterior width is known, and in units of it."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LaplaceFit:
-    """Laplace approximation of a posterior; `found` is False where the search did not converge."""
+    """Laplace approximation of a posterior; `found` is False if the search did not converge."""
 
     density: SceneDensity
     z: np.ndarray
@@ -179,7 +179,7 @@ class LaplaceFit:
 
 
 def fit_laplace(density: SceneDensity, key: Array, progress: Progress) -> LaplaceFit:
-    """The heaviest mode of a posterior, from prior draws."""
+    """Find the heaviest mode of a posterior from prior draws."""
     size = density.program.size
     starts = from_prior(density.program, key, 6, density.data)
     potential = _scaled_potential(density, np.zeros(size), np.eye(size), FIRST_STEP)
@@ -188,7 +188,7 @@ def fit_laplace(density: SceneDensity, key: Array, progress: Progress) -> Laplac
 
 
 def _refine(density: SceneDensity, z: np.ndarray, covariance: np.ndarray) -> LaplaceFit:
-    """Search the mode in coordinates in which the posterior is about standard normal."""
+    """Search the mode in coordinates in which the posterior is nearly standard normal."""
     for _ in range(2):  # the second search knows the width that the first has found
         factor = np.linalg.cholesky(covariance)
         potential = _scaled_potential(density, z, factor, STEP)
@@ -204,7 +204,7 @@ def _refine(density: SceneDensity, z: np.ndarray, covariance: np.ndarray) -> Lap
 def _scaled_potential(
     density: SceneDensity, origin: np.ndarray, factor: np.ndarray, step: float
 ) -> ValueAndGradient:
-    """Potential, and its gradient by central differences, of y in z = origin + factor y."""
+    """Return the potential and its differences in y, with z = origin + factor y."""
 
     def value_and_gradient(y: np.ndarray) -> tuple[float, np.ndarray]:
         z = origin + factor @ y
@@ -222,7 +222,7 @@ def _scaled_potential(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PosteriorChange:
-    """Changes of readings and posterior by another scene, per coordinate of the baseline."""
+    """Changes of readings and posterior by another scene, per coordinate."""
 
     fit: LaplaceFit
     largest_move: float
@@ -232,13 +232,13 @@ class PosteriorChange:
 
     @property
     def changes(self) -> np.ndarray:
-        """The larger of the shift and the change of the sd; NaN where it is not known."""
+        """Larger one of the shift and the change of the sd; NaN if unknown."""
         return np.fmax(np.abs(self.shift), np.abs(self.sd_ratio - 1.0))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Baseline:
-    """The scene that others are compared with; `names` are the judged parameters, None for all."""
+    """The scene with which others are compared; `names` are the judged parameters, None for all."""
 
     fit: LaplaceFit
     noise_sd: Readings
@@ -246,14 +246,14 @@ class Baseline:
 
     @property
     def judged(self) -> np.ndarray:
-        """For each coordinate, whether it is judged."""
+        """True for coordinates that are judged."""
         density = self.fit.density
         if self.names is None:
             return np.ones(len(density.labels), bool)
         return np.isin(density.labels, self.names) | np.isin(density.sites, self.names)
 
     def compare(self, other: SceneDensity) -> PosteriorChange:
-        """Replace the scene by another, whose mode is sought near that of this one."""
+        """Compare another scene, whose mode is searched near that of this one."""
         fit, sd = self.fit, self.fit.sd
         _, ours, theirs = np.intersect1d(fit.density.labels, other.labels, return_indices=True)
         start = np.zeros(len(other.labels))
@@ -271,7 +271,7 @@ class Baseline:
         return PosteriorChange(found, largest, rms, shift, sd_ratio)
 
     def _moves(self, other: SceneDensity, start: np.ndarray) -> np.ndarray:
-        """Changes of the predictions of all valid readings in units of their noise."""
+        """Return changes of predictions of valid readings in units of their noise."""
         # A sensor far beyond its full scale has no noise, and what it records does not move.
         before, after = self.fit.density.noise_free(self.fit.z), other.noise_free(start)
         valid = np.asarray(self.fit.density.data.valid)
@@ -282,7 +282,7 @@ class Baseline:
         return np.concatenate(rows)
 
     def largest_change(self, change: PosteriorChange) -> float:
-        """The largest change of a judged parameter; infinite where it is not known."""
+        """Return the largest change of a judged parameter; infinite if unknown."""
         # A parameter that the other scene lacks is not judged, unless the user named it.
         changes = change.changes[self.judged]
         missing = np.isnan(changes)
@@ -290,7 +290,7 @@ class Baseline:
         return np.inf if unknown or not change.fit.found else float(np.nanmax(changes))
 
     def describe(self, change: PosteriorChange) -> str:
-        """The largest change in words: `refractive_index[550] moves by +0.43 sd`."""
+        """Describe the largest change: `refractive_index[550] moves by +0.43 sd`."""
         if not change.fit.found:
             return "its posterior has no mode near that of the full scene"
         changes = np.where(self.judged, np.nan_to_num(change.changes, nan=-1.0), -1.0)
@@ -304,7 +304,7 @@ class Baseline:
         return f"the sd of {label} changes by {widening:+.0%}"
 
     def missing(self, change: PosteriorChange) -> list[str]:
-        """Parameters that the other scene does not have."""
+        """Return parameters that the other scene does not have."""
         sites = np.asarray(self.fit.density.sites)
         present = set(sites[~np.isnan(change.changes)])
         return [name for name in dict.fromkeys(sites.tolist()) if name not in present]
@@ -322,7 +322,7 @@ class SceneDensities:
         self._densities: dict[Scene, SceneDensity] = {}
 
     def density(self, scene: Scene) -> SceneDensity:
-        """The density of a scene; a prior for a parameter that it lacks is not used."""
+        """Return the density of a scene, without priors for parameters it lacks."""
         if scene not in self._densities:
             table = self.priors(scene)
             priors = {name: table.row(name) for name in table.read}
@@ -331,19 +331,19 @@ class SceneDensities:
         return self._densities[scene]
 
     def priors(self, scene: Scene) -> PriorTable:
-        """The priors, which note the names that the model reads with that scene."""
+        """Return the priors, which record the names that the model reads with that scene."""
         table = PriorTable(self._priors)
         inspect_model(self._request.model, self._data, scene, table, self._request.links)
         return table
 
     def baseline(self, scene: Scene, parameters: tuple[str, ...] | None) -> Baseline:
-        """A scene to compare with."""
+        """Return a scene with its mode, to compare others with."""
         density = self.density(scene)
         fit = fit_laplace(density, jax.random.key(self._request.seed), self.progress)
         return Baseline(fit, density.noise_sd(fit.z), parameters)
 
     def costs(self) -> dict[Scene, dict[str, float]]:
-        """Operations, compile and run seconds of all scenes so far, timed in turns."""
+        """Return operations, compile and run seconds of all scenes so far, timed in turns."""
         calls = [
             functools.partial(density.evaluate, np.zeros(density.program.size))
             for density in self._densities.values()
