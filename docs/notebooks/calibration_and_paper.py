@@ -22,7 +22,7 @@ import polar_bayes as pb
 #
 # Of the capture only the layout counts: which views, which readings, which errors. Here a polished
 # plate at 12 angles, and 200 simulations. (The
-# [numbers to quote](../calibration.md#what-it-costs-and-what-it-showed) come from a thousand and
+# [numbers to quote](../calibration.md#cost-and-coverage-measured) come from a thousand and
 # more, of the paper's scene.)
 
 # %%
