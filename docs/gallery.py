@@ -77,7 +77,7 @@ plt.show()
 # ## Where to look next
 #
 # Of all directions in the measured azimuths, these would narrow the interval of the index most,
-# and the curve shows [by how much](identifiability.md#choosing-further-views).
+# and the curve shows [by how much](identifiability.md#choosing-further-views-optimal-design).
 
 # %% mystnb={"image": {"alt": "Expected width of the interval of the index after each added view"}}
 index = pb.design.SingleParameter("refractive_index")
@@ -116,8 +116,9 @@ pb.plots.plot_maps(maps)
 # %% [markdown]
 # ## Means of regions
 #
-# The mean over a region has an interval of its own. It is much narrower than that of a pixel,
-# because [errors of pixels are independent](maps.md#regions) but for what they share.
+# The interval of the mean over a region is much narrower than that of a pixel, because
+# [errors of pixels are independent](maps.md#means-and-contrasts-of-regions), except for errors of
+# shared parameters.
 
 # %% mystnb={"image": {"alt": "Error of the mean index of three regions, with intervals"}}
 labels = np.where(noise["stokes_scale"] > 0.002, "dark", np.where(x < 16, "left", "right"))

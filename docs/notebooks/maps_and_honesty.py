@@ -87,7 +87,7 @@ pd.concat(
 # %% [markdown]
 # Both hold the truth about as often as they say; the correction changes little, because with twelve
 # readings and two unknowns these posteriors are nearly normal. Where they are not, it matters: [the
-# numbers](../maps.md#report).
+# numbers](../maps.md#report-and-coverage-of-a-map).
 #
 # Strictly, coverage is promised on average over truths that are drawn from the prior. These truths
 # were painted, so a share a little above or below says nothing against the map; a share far off

@@ -173,7 +173,7 @@ plt.show()
 # ## What to conclude
 #
 # * Glass: quote the wide interval, with what it assumes
-#   ([goniometer](../goniometer.md#what-the-fit-assumes)).
+#   ([goniometer](../goniometer.md#assumptions-of-the-fit)).
 # * PTFE: quote no index. The data say little of it with either scene, and the scene that fits best
 #   is contradicted by the brightness. Measure the specular lobe, or add its brightness to the fit.
 # * Fit quality does not choose between scenes. What is known of the sample does.
