@@ -44,4 +44,4 @@ def clean_up() -> list[str]:
 
 def resume_hint(path: Path) -> str:
     """Return the cleanup sentence of work that can be resumed."""
-    return f"{path}: what is done is kept; repeat the command with --resume to go on"
+    return f"{path}: finished work is saved; repeat the command with --resume to continue"

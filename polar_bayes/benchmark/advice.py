@@ -153,7 +153,9 @@ def accuracy_sentences(result: Study, tolerance: float = 0.1) -> list[str]:
     view = accuracy_view(result)
     sentences = [_advice(view.table[view.is_given], view.errors[view.is_given], tolerance)]
     if view.doubts:
-        sentences.append(f"Take it with care: of the reference itself, {view.doubts}.")
+        sentences.append(
+            f"Use this advice with care, since the reference is in doubt: {view.doubts}."
+        )
     return sentences
 
 

@@ -188,13 +188,13 @@ def _conclusion(row: pd.Series, level: float) -> str:
     if row["repeats"] < 2:
         return "too few repeats have an answer"
     if row["p_value"] < level:
-        return f"repeats scatter {row['ratio']:.1f} times more than the intervals say"
+        return f"repeats scatter {row['ratio']:.1f} times more than the intervals predict"
     if row["p_value"] > 1.0 - level:
         return (
-            f"repeats scatter only {row['ratio']:.2g} times as much as the intervals say: the rest "
-            "of the intervals is what all repeats share"
+            f"repeats scatter only {row['ratio']:.2g} times as much as the intervals predict: the "
+            "rest of the intervals is what all repeats share"
         )
-    return "repeats scatter about as much as the intervals say"
+    return "repeats scatter about as much as the intervals predict"
 
 
 def _position(proxy: float, draws: np.ndarray) -> dict[str, float]:

@@ -203,7 +203,7 @@ def _label_readings(
     ranked: PredictivePit, data: Observations, numbers: np.ndarray
 ) -> dict[str, xr.Dataset]:
     """Label PIT values of readings, their indices, and Pareto k of leaving each one out."""
-    k_name = f"Pareto k of the weights without it; above {MAX_PARETO_K} they say little"
+    k_name = f"Pareto k of the weights without it; above {MAX_PARETO_K} they are unreliable"
     chosen: dict[str, tuple] = {}
     for name, entry in ranked.entry.items():
         k = ranked.left_out_k[name]

@@ -285,9 +285,9 @@ def calibration_verdict(calibration: xr.DataTree | CalibrationView) -> list[str]
         sentences.append(f"Half of the fits or more have failed: {advice}.")
     if np.mean(statuses == Status.NOT_TRUSTED) > HALF:
         sentences.append(
-            "Most fits say themselves that they cannot be trusted: the ranks judge the method, not "
-            "the model. Another method or longer chains may do; chains (method='nuts') are the "
-            "slowest and the surest."
+            "Most fits fail their own diagnostics: the ranks test the method, not the model. Use "
+            "another method or longer chains; chains (method='nuts') are the slowest and the most "
+            "reliable method."
         )
     return sentences + _reading_sentences(calibration)
 
@@ -300,7 +300,7 @@ def _reading_sentences(calibration: CalibrationView) -> list[str]:
     names = ", ".join(dict.fromkeys(table["reading"]))
     sentences = [
         f"Readings ({names}; fresh ones and ones left out) "
-        f"{'pass' if is_calibrated(table) else 'fail'} a joint test of their own that a right "
+        f"{'pass' if is_calibrated(table) else 'fail'} a separate joint test that a right "
         f"model fails {FALSE_ALARMS:.0%} of the time."
     ]
     for label, row in table.iterrows():
@@ -309,7 +309,7 @@ def _reading_sentences(calibration: CalibrationView) -> list[str]:
             sentences.append(f"{label}: {reading_deviation(row)}{p_value}.")
     sentences += [
         f"{label}: in {int(row['untrusted'])} of {int(row['answered'])} fits the weights "
-        f"without it say little (Pareto k above {MAX_PARETO_K:g})."
+        f"without it are unreliable (Pareto k above {MAX_PARETO_K:g})."
         for label, row in table[table["untrusted"] > 0].iterrows()
     ]
     return sentences

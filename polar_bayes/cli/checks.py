@@ -225,7 +225,7 @@ SHOWN = ["error", "worst", "pareto_k", "r_hat", "seconds_first", "seconds_again"
 ACCURACY_COLUMNS = (
     "error: largest error of a posterior mean or sd, in posterior sds of the reference",
     "worst: the parameter that has it",
-    "pareto_k, r_hat: what the method says of itself; at most 0.7 and 1.01 are good",
+    "pareto_k, r_hat: diagnostics of the method; at most 0.7 and 1.01 are good",
     "seconds_first, seconds_again: of the first fit, compilation included, and of the next",
 )
 

@@ -246,8 +246,8 @@ def regions(maps: Path, labels: Path, against: int | None, as_json: bool) -> Non
 @capture_argument
 @scene_options
 @option("--tolerance", type=float, default=0.1, help="Posterior sd.")
-@option("--keep", multiple=True, help="Effect that stays; give it once per effect.")
-@option("--drop", multiple=True, help="Effect that goes; give it once per effect.")
+@option("--keep", multiple=True, help="Effect to keep; give it once per effect.")
+@option("--drop", multiple=True, help="Effect to drop; give it once per effect.")
 @seed_option
 @json_option
 @out_option(RESULT_FILE, "Ledger to write.", required=False)

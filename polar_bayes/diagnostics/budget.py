@@ -60,7 +60,7 @@ def budget(
     fit = view_of(result)
     if not has_budget(fit):
         raise FitError(
-            "it does not say what its set-up is known to",
+            "it has no input quantities of its set-up",
             where="budget: result",
             hint="fit with a set-up whose scene has input quantities, such as camera",
         )
@@ -211,7 +211,7 @@ def budget_sentences(fit: FitView) -> tuple[str, ...]:
     better, now = better_known(fit, worst), budget(fit).loc[worst, "sd"]
     factors = join([f"{label} {factor:.2g} times" for label, factor in wider.items()])
     return (
-        "What the set-up is known to makes standard uncertainties larger than those of a perfect "
-        f"one: {factors}. That of {worst} would be {better.sd:.2g} instead of {now:.2g} with the "
-        f"{better.meaning} known to {better.half} instead of {better.known}.",
+        "The uncertainty of the set-up makes standard uncertainties larger than those of a "
+        f"perfect one: {factors}. That of {worst} would be {better.sd:.2g} instead of {now:.2g} "
+        f"with the {better.meaning} known to {better.half} instead of {better.known}.",
     )

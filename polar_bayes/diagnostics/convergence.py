@@ -334,7 +334,7 @@ def _corrections(weights: np.ndarray, found: Sequence[Scalar]) -> Iterator[str]:
     if changes:
         names = listed(text for _, text in sorted(changes, reverse=True))
         yield (
-            f"By its own weighted draws the approximation is off: {names}; use "
+            f"Importance weights correct the approximation: {names}; use "
             "method='importance' or 'nuts' where that matters."
         )
 
@@ -386,8 +386,8 @@ def _chain_notes(fit: FitView) -> Iterator[str]:
     deep = fit.stats.get("reached_max_treedepth")
     if deep is not None and deep.sum() > LIMITS.deep_trees * deep.size:
         yield (
-            f"{int(deep.sum())} of {deep.size} draws reached the largest tree depth: steps were "
-            "cut short, which biases nothing but makes draws alike; raise it, as in "
+            f"{int(deep.sum())} of {deep.size} draws reached the largest tree depth: "
+            "trajectories were cut short, which correlates draws without bias; raise it, as in "
             "Nuts(max_tree_depth=10)."
         )
 
@@ -398,7 +398,7 @@ def _estimate_cautions(fit: FitView) -> Iterator[str]:
     if fit.method == "point" and len(undetermined):
         yield (
             f"No standard error: {listed(dict.fromkeys(undetermined))}; least squares does not "
-            "determine such values, so they say nothing."
+            "determine such values, so do not use them."
         )
 
 

@@ -68,7 +68,7 @@ def map_coverage(maps: xr.Dataset, truth: xr.Dataset) -> pd.DataFrame:
     known = {name: true for name in names if (true := _truth_of(maps, truth, name)) is not None}
     if not known:
         raise CaptureError(
-            "it knows the truth of no parameter of the map",
+            "it states the truth of no parameter of the map",
             where=_name_of(truth),
             hint=f"give a simulated capture, with one of {', '.join(sorted(names))} as `true_...`",
         )

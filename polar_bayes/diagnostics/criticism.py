@@ -50,14 +50,14 @@ INDEX_PARAMETERS = (
 )
 """Parameters whose prior bounds the index of a material."""
 QUESTIONS = {
-    "priors": "are the material and what carries it in the tails of their priors?",
+    "priors": "are the material and correlated parameters in the tails of their priors?",
     "absent": "is a part of the scene, or a fault of the instrument, not seen at all?",
     "noise": "do the readings scatter more, or less, than was stated?",
     "bounds": "does a parameter lie against a bound?",
     "index": "does Brewster's angle mean an index that the prior excludes?",
     "systematic errors": "does the answer rest on smooth errors that the readings do not show?",
-    "angle": "do neighboring directions err alike?",
-    "wavelength": "do the wavelengths of one view err alike?",
+    "angle": "do neighboring directions have correlated errors?",
+    "wavelength": "do the wavelengths of one view have correlated errors?",
     "outliers": "is a reading farther out than noise explains?",
     "leave-one-out": "are leave-one-out PIT values uniform?",
     "influence": "does a single reading decide the answer?",
@@ -339,7 +339,7 @@ def _systematic_errors(fit: FitView, absent: Sequence[Scalar]) -> Finding:
     if "scenes" in groups:  # those without smooth errors are among the scenes compared
         return Finding("passed")
     if "without_discrepancy" not in groups:
-        reason = "Nothing is known of the answer without smooth errors, which was not fitted."
+        reason = "The fit without smooth errors was not made."
         return Finding("not computed", sentence=reason)
     sizes = [*amplitude, *(s for s in found if s.name == NOISE_FACTOR)]
     below = _prior_probability(fit, sizes)

@@ -49,7 +49,7 @@ def sensitivity(fit: FitView) -> pd.DataFrame:
         remarks = _remarks(scalar.draws, compared, *rates)
         if scalar.label in alone:
             reading, factor = alone[scalar.label]
-            remarks.append(f"rests on {reading}: {factor:.1f} times as wide without it")
+            remarks.append(f"depends on {reading}: {factor:.1f} times as wide without it")
         rows.append([*compared, *rates, "; ".join(remarks)])
     index = pd.Index([scalar.label for scalar in fit.scalars])
     return pd.DataFrame(rows, columns=list(COLUMNS), index=index)
@@ -120,5 +120,5 @@ def _remarks(draws: np.ndarray, compared: list[Any], prior: float, likelihood: f
         remarks.append("outside the prior's 95%")
     if prior >= LIMITS.sensitive:
         pulled = likelihood >= LIMITS.sensitive
-        remarks.append("priors and data may pull apart" if pulled else "leans on the priors")
+        remarks.append("priors and data may conflict" if pulled else "depends on the priors")
     return remarks

@@ -552,14 +552,14 @@ def sentences_of_auto(provenance: Provenance) -> list[str]:
             error = step.get("monte_carlo")
             within = "an unknown number of" if error is None else f"{error:.2g}"
             sentences.append(
-                f"{name} was taken: its means and standard deviations are expected within "
-                f"{within} posterior sd, and {summary['tolerance']:g} were asked for."
+                f"{name} was selected: its means and standard deviations are expected within "
+                f"{within} posterior sd; the tolerance is {summary['tolerance']:g}."
             )
         else:
-            sentences.append(f"{name} was not taken: {step['why']}.")
+            sentences.append(f"{name} was rejected: {step['why']}.")
     if not summary["met"]:
         sentences.append(
-            f"Nothing was good enough; these are the numbers of {summary['chosen']}, which came "
-            "nearest. Give more seconds or a larger tolerance, or doubt them."
+            f"No method met the tolerance; the numbers are those of {summary['chosen']}, which "
+            "came nearest. Give more seconds or a larger tolerance, or do not rely on them."
         )
     return sentences

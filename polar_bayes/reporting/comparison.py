@@ -84,7 +84,7 @@ def comparison_page(fits: Mapping[str, xr.DataTree]) -> page.Page:
     sections = [
         page.Section("predictions", "Predictions", [*predictions, *page.make_bullets(left_out)]),
         page.Section("parameters", "Parameters", [figure, parameter_table(comparison)]),
-        page.Section("prior", "What the prior said, and what the data", prior, "Prior and data"),
+        page.Section("prior", "Prior and data", prior, "Prior and data"),
         page.Section("settings", "What differs", [settings_table(provenances)]),
     ]
     names = (text.capture_name(each, "") for each in provenances.values())

@@ -49,7 +49,7 @@ STATUSES = {
 CHECKS = {
     "priors": "medians in the tails of their priors",
     "noise": "scatter above its prior, or three times the stated errors",
-    "residuals": "neighboring views that err alike, an outlier, or all larger than the noise",
+    "residuals": "correlated errors of neighboring views, an outlier, or all above the noise",
     "bounds": "a posterior that lies against a bound",
     "any": "any of these",
 }

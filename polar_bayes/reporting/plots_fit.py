@@ -441,7 +441,7 @@ def _shrinkage_legend(rows: pd.DataFrame) -> list[Artist]:
         label = "alone, without the population: about, 95%"
         handles.append(line(color=lighten(PURPLE, 0.25), marker="o", label=label, **_hollow()))
     if not has_alone.all():
-        handles.append(line(color=PURPLE, ls=(0, (1, 3)), label="alone it says nothing"))
+        handles.append(line(color=PURPLE, ls=(0, (1, 3)), label="alone: undetermined"))
     handles += [
         Patch(color=lighten(GRAY, 0.6), label="location of the population, 95%"),
         Patch(color=lighten(GRAY, 0.85), label="a new member, 95%"),

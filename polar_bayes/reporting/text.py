@@ -236,9 +236,9 @@ def pooling(fit: FitView) -> list[str]:
             name = f"{', '.join(names)} ({factor:.2f})"
             groups.setdefault(bool(factor > 0.5), []).append(name)
     phrases = {
-        True: "For {} the population says more than the readings of a single member (pooling "
+        True: "The population determines {} more than the readings of a single member (pooling "
         "factor in brackets): quote such estimates as those of a member of this population.",
-        False: "For {} the readings of a single member say more than the population (pooling "
+        False: "The readings of a single member determine {} more than the population (pooling "
         "factor in brackets).",
     }
     return [phrases[is_pooled].format(join(names)) for is_pooled, names in groups.items()]
@@ -278,7 +278,7 @@ def predictive_sentences(fit: FitView) -> list[str]:
         if each.loo and each.loo.unreliable:
             effect = (
                 "leave-one-out cannot be approximated with these draws, so its results on this "
-                "page mean little."
+                "page are unreliable."
                 if 2 * each.loo.unreliable > each.count
                 else "they are so influential that leave-one-out cannot be approximated for them. "
                 "Inspect them first."
@@ -356,7 +356,7 @@ def trust(fit: FitView) -> str:
             "so do not read them as intervals."
         )
     if verdict.cautions:
-        return "Trust the intervals with care: the cautions say what speaks against them."
+        return "Use the intervals with care: see the cautions."
     return (
         f"{verdict.nothing_against} A calibration of this layout shows how "
         "often such intervals contain the truth, if the scene is the right one."
@@ -424,7 +424,7 @@ def comparison_headline(comparison: FitComparison) -> str:
     if len(comparison.loo) < 2:
         return "Predictions are not compared; parameters are."
     if not _is_clearly_worse(comparison.loo.iloc[1]):
-        return "The readings do not tell which of these fits predicts best."
+        return "The readings do not decide which of these fits predicts best."
     return f"{comparison.loo.index[0]} predicts the readings best."
 
 
@@ -506,7 +506,7 @@ def map_headline(counts: pd.DataFrame) -> tuple[str, bool]:
     if read == 0:
         return "No pixel was read: these maps are empty.", False
     if good == 0 and by_status.get("contradicted", 0):
-        return "No pixel has an answer that its readings bear out: do not use these maps.", False
+        return "Readings contradict every pixel that has an answer: do not use these maps.", False
     if good == 0:
         return "No pixel has an answer: do not use these maps.", False
     if good == read:
@@ -617,7 +617,7 @@ def wrong_on_purpose(provenance: Provenance) -> list[str]:
         return []
     return [
         "What captures were simulated by differs on purpose from what was fitted, in its "
-        f"{join(differing)}: this calibration asks whether that mistake is seen."
+        f"{join(differing)}: this calibration tests whether that mistake is detected."
     ]
 
 
@@ -654,4 +654,4 @@ def reference_sentence(result: Study) -> str:
         f"effective sample size of {study['reference_ess']:,.0f}; its own Monte Carlo "
         f"error is at most {study['reference_error']:.2g} posterior sd."
     )
-    return f"{sentence} Against it speaks: {view.doubts}." if view.doubts else sentence
+    return f"{sentence} There are doubts about it: {view.doubts}." if view.doubts else sentence

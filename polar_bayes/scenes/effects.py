@@ -50,7 +50,7 @@ def find_forced(
     for effect in dropped:
         if effect in kept:
             raise SceneError(
-                "it is both to keep and to drop", where=effect.name, hint="name it in one only"
+                "the effect is in both keep and drop", where=effect.name, hint="remove it from one"
             )
     return kept, dropped
 
@@ -114,7 +114,9 @@ class EffectSelection:
                 break
             worst = max(optional, key=self.change)
             options[worst.key_path].remove(worst)
-            remarks[worst] = f"with all others that could go, {baseline.describe(combined)}"
+            remarks[worst] = (
+                f"without all other effects that may be dropped, {baseline.describe(combined)}"
+            )
         self.scene, self.selected_from, self.combined = scene, baseline, combined
         dropped = {effect.key_path: effect for effect in (*forced, *optional)}
         left = [part for _, part in parts_of(scene)]
@@ -125,7 +127,7 @@ class EffectSelection:
             if not remark and instead not in (None, effect):
                 remark = f"{instead.name} instead"
             elif not remark and instead is None and not self.kept[effect]:
-                remark = "it goes with the part around it"
+                remark = "it is removed with the part that contains it"
             self.reasons[effect] = self._reason(effect, remark)
 
     def _without(self, forced: list[Effect]) -> Baseline:
@@ -161,7 +163,7 @@ class EffectSelection:
         if change <= self.tolerance:
             which = "parameter" if self.baseline.names is None else "judged parameter"
             found = f"alone no {which} changes by more than {max(change, 0.001):.2g} sd"
-            remark = remark or ("a part of it stays by your choice" if is_kept else "")
+            remark = remark or ("a part inside it is kept by your choice" if is_kept else "")
         missing = [] if is_kept else self.baseline.missing(self.changes[effect])
         unfitted = f"not fitted then: {', '.join(missing)}" if missing else ""
         return "; ".join(text for text in (remark, found, unfitted) if text)

@@ -296,7 +296,7 @@ class Baseline:
         changes = np.where(self.judged, np.nan_to_num(change.changes, nan=-1.0), -1.0)
         most = int(np.argmax(changes))
         if changes[most] < 0.0:
-            return "it leaves nothing to judge"
+            return "no judged parameter is left without it"
         label = self.fit.density.labels[most]
         shift, widening = change.shift[most], change.sd_ratio[most] - 1.0
         if abs(shift) >= abs(widening):

@@ -180,7 +180,7 @@ def _why_not(scene: xr.Dataset) -> str:
     if is_apart(difference, error):
         return f"Not {name}: it predicts worse, by {difference:.1f} ± {error:.1f} nat in all."
     if "priors" in str(scene["criticism"].item()):
-        return f"Not {name}: its parameters are where their priors hardly allow them."
+        return f"Not {name}: its parameters are in the tails of their priors."
     return f"Not {name}: it adds nothing to the others ({difference:.1f} ± {error:.1f} nat behind)."
 
 

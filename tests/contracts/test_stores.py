@@ -71,7 +71,9 @@ def test_what_was_broken_off_goes_on_to_the_same_bits(kind, whole, begun, tmp_pa
         said.extend(clean_up())  # as an interrupt does
 
     found = kind.run(store, resume=True, progress=progress)
-    assert said == [f"{store}: what is done is kept; repeat the command with --resume to go on"]
+    assert said == [
+        f"{store}: finished work is saved; repeat the command with --resume to continue"
+    ]
     assert seen[0] > 2 * kind.block  # what is done is not done again
     assert seen[-1] == kind.total
     assert_same_bits(found, whole)

@@ -126,7 +126,7 @@ def test_the_first_rung_that_is_good_enough_is_taken():
     assert said["method"] == "importance"
     assert pb.verdict(result).converged
     (sentence,) = pb.inference.auto_sentences(result)
-    assert "was taken: its means and standard deviations are expected within" in sentence
+    assert "was selected: its means and standard deviations are expected within" in sentence
 
 
 @pytest.mark.thorough

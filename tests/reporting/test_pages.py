@@ -250,7 +250,7 @@ ASKED_OF_A_REPORT: dict[str, Callable[[], tuple]] = {
     "it is of another image": lambda: (
         mixed(), {"truth": truth(), "uncorrected": mixed().isel(y=slice(3))}
     ),
-    "it knows the truth of no parameter": lambda: (mixed(), {"truth": xr.Dataset()}),
+    "it states the truth of no parameter": lambda: (mixed(), {"truth": xr.Dataset()}),
 }  # fmt: skip
 """Results and arguments that do not go together, by what is said of them."""
 
