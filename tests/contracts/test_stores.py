@@ -40,7 +40,7 @@ def whole(kind: Stored, tmp_path_factory: pytest.TempPathFactory) -> xr.Dataset 
 
 @pytest.fixture(scope="module")
 def writes(kind: Stored, tmp_path_factory: pytest.TempPathFactory) -> int:
-    """How often a run writes to the disk."""
+    """Count how often a run writes to the disk."""
     written: list[int] = []
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(os, "fsync", written.append)
@@ -280,7 +280,7 @@ def opened(file, topics=TOPICS, *, resume=True):
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    """Of three blocks."""
+    """Return the file of one of three blocks."""
     file = tmp_path / "map.zarr.progress"
     with opened(file, resume=False) as journal:
         journal.read()

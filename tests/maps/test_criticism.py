@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 METHOD = pb.methods.CorrectedLaplace(sampler=None)
 KNOWN = {**ASKED, "method": METHOD}
 INFERRED = {**KNOWN, "model": "per_material"}
-"""Where the stated errors are taken as they are, and where pixels infer by what factor they err."""
+"""Whether stated errors are used unchanged, or pixels infer a factor on them."""
 
 VIEWS = np.concatenate([np.linspace(20.0, 45.0, 9), np.linspace(64.0, 80.0, 9)])
 ERROR = 0.01

@@ -79,7 +79,7 @@ class Twin:
 
 
 def _guide_covariance(program: Program, z: jax.Array, data) -> jax.Array:
-    """Of the guide, in the order of the program's own vector."""
+    """Return the covariance of the guide, in the order of the program's own vector."""
     guide = AutoLaplaceApproximation(program.model)
     with handlers.seed(rng_seed=0):
         guide(data)
@@ -95,7 +95,7 @@ GOAL = 1e-4
 
 
 def assert_modes_agree(plan, pixels, covariance=None):
-    """Of all pixels that arrived; how many did."""
+    """Compare the modes of all pixels that converged; return how many did."""
     found = find_modes(plan.engine, pixels)
     twin = Twin(plan.engine.program)
     for number in np.flatnonzero(found.converged):
