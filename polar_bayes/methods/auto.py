@@ -243,5 +243,5 @@ STUDY_METHODS: Mapping[str, AbstractMethod] = MappingProxyType(
         "nuts long": Nuts(warmup=1000, draws=4000, most_draws=4000),
     }
 )
-"""Methods that `polar_bayes.accuracy` compares by default. To add one, pass `{**STUDY_METHODS,
-"mine": Mine()}`."""
+"""Methods that `polar_bayes.accuracy` compares by default. To add one, pass
+`{**STUDY_METHODS, "mine": Mine()}`."""
