@@ -35,7 +35,7 @@ TOLERANCE = 0.1
 
 
 def study(name: str, case: Case, number: int, keep: Path, quick: bool) -> xr.DataTree:
-    """The study of one scene, measured now or kept."""
+    """Return the study of one scene, measured now or loaded."""
     file = keep / f"{number}{'-quick' if quick else ''}.nc"
     if not file.exists():
         asked = {"overrides": ()} if quick else {}
@@ -127,7 +127,7 @@ def write(text: str) -> None:
 
 
 def main(keep: Path, quick: bool, only: tuple[int, ...]) -> None:
-    """Measure, draw and write what was asked for."""
+    """Measure, draw and write what the options select."""
     jax.config.update("jax_enable_x64", True)
     keep.mkdir(parents=True, exist_ok=True)
     studies, trials = {}, {}

@@ -1,4 +1,4 @@
-"""Six captures from easy to hard: what methods are measured on, and methods are not tuned on.
+"""Six captures from easy to hard, on which methods are measured but not tuned.
 
 The first two are smooth plates, three parameters; the others have a rough surface over a body,
 seven. The last two are hard: the degree of polarization alone says next to nothing of absorption,
@@ -108,4 +108,4 @@ CASES: Mapping[str, Case] = MappingProxyType(
         ),
     }
 )
-"""From easy to hard, by name."""
+"""Captures from easy to hard, by name."""

@@ -1,4 +1,4 @@
-"""How often `method="auto"` meets its tolerance, and whether it says so where it does not.
+"""How often `method="auto"` meets its tolerance, and whether it reports when it does not.
 
     python benchmarks/auto_method.py 200 --keep FOLDER      half plates, half rough bodies
 
@@ -88,7 +88,7 @@ def kept(folder: Path, name: str, count: int, auto: pb.methods.Auto) -> list[dic
 
 
 def say(name: str, fits: list[dict[str, Any]], tolerance: float) -> None:
-    """One row of the table."""
+    """Print one row of the table."""
     sound = [fit for fit in fits if not fit["reference_doubts"]]
     within = [fit["error"] <= tolerance for fit in sound]
     flagged = [not fit["said_met"] for fit in sound]

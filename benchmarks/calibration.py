@@ -1,4 +1,4 @@
-"""Fits per second of simulation-based calibration, beside a loop of `MCMC.run` and simuk.
+"""Fits per second of simulation-based calibration, compared with a loop of `MCMC.run` and simuk.
 
     pip install '.[peers]'
     python benchmarks/calibration.py           1000 fits of ours by each method

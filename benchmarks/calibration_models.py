@@ -1,4 +1,4 @@
-"""Simulation-based calibration of whole models by what `polar_bayes.fit` runs, on small layouts.
+"""Simulation-based calibration of whole models by `polar_bayes.fit`, on small layouts.
 
     python benchmarks/calibration_models.py material 3000        so many simulations
     python benchmarks/calibration_models.py hierarchical         200 of them
@@ -62,7 +62,7 @@ def one_material(wavelengths: tuple[float, ...] = ()) -> xr.Dataset:
 
 
 def stokes() -> xr.Dataset:
-    """The same views, read as q and u beside intensity."""
+    """Return the same views, read as q and u in addition to intensity."""
     capture = one_material()
     level = xr.zeros_like(capture["dop"])
     return capture.drop_vars("dop").assign(
@@ -127,7 +127,7 @@ EVERY = {
 
 
 def said(found: xr.DataTree) -> str:
-    """Table and verdict of one calibration."""
+    """Print table and verdict of one calibration."""
     table = pb.summary(found)
     shown = pd.DataFrame({"p": table["p_value"].map("{:.3f}".format)})
     for percent in (50, 80, 95):

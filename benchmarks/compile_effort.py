@@ -1,4 +1,4 @@
-"""What XLA's optimizations cost a first fit, and what they give to the next ones.
+"""Time of a first fit and of the next ones by XLA's optimization level.
 
     python benchmarks/compile_effort.py
 

@@ -1,4 +1,4 @@
-"""What each effect costs: compilation, operations and time of one gradient, on against off.
+"""Cost of each effect: compilation, operations and time of one gradient, on against off.
 
     python benchmarks/effect_costs.py
 

@@ -1,4 +1,4 @@
-"""The chosen effects against everything: the same posterior, and how much faster.
+"""The chosen effects against all effects: differences of the posterior, and the speed-up.
 
     python benchmarks/effects.py [glass plastic leaf paint]
 
@@ -51,7 +51,7 @@ class Plate(pb.simulation.Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One of the four.
+    """One of the four cases.
 
     Args:
         preset: Material to simulate.
@@ -130,7 +130,7 @@ def fit(data: xr.Dataset, scene: pb.Scene) -> tuple[Any, float, bool]:
 
 
 def run(name: str) -> None:
-    """Choose, fit twice, and print what came out."""
+    """Choose effects, fit twice, and print the result."""
     case = CASES[name]
     data = case.capture()
     begin = time.perf_counter()
@@ -163,7 +163,7 @@ def run(name: str) -> None:
 
 
 def main() -> None:
-    """Run the cases that were asked for."""
+    """Run the selected cases."""
     jax.config.update("jax_enable_x64", True)
     for name in sys.argv[1:] or CASES:
         run(name)

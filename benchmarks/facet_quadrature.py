@@ -1,4 +1,4 @@
-"""What a facet costs and what it buys: the front of the dial `FacetQuadrature`, as a table.
+"""Accuracy and cost of facets: the front of the setting `FacetQuadrature`, as a table.
 
     python benchmarks/facet_quadrature.py
 
@@ -134,7 +134,7 @@ def worst(found: np.ndarray, truth: np.ndarray, at: np.ndarray) -> str:
 
 
 def gradient(rule: Callable[[str], Polarization], at: np.ndarray) -> Callable[[], jax.Array]:
-    """Derivatives of reflection and way out by roughness and index, of a capture's size."""
+    """Derivatives of reflection and exit by roughness and index, for the size of a capture."""
     reflection, way_out = rule("sky"), rule("exit")
     some = jnp.asarray(at[:, ::5])
 
@@ -146,7 +146,7 @@ def gradient(rule: Callable[[str], Polarization], at: np.ndarray) -> Callable[[]
 
 
 def relative_time(run: Callable[[], jax.Array], unit: Callable[[], jax.Array]) -> float:
-    """The least of many, in turns, so that a busy machine slows both."""
+    """Return the shortest of many times, in turns, so that a busy machine slows both."""
     seconds: dict[Callable[[], jax.Array], list[float]] = {run: [], unit: []}
     for _, task in itertools.product(range(40), seconds):
         start = time.perf_counter()
@@ -198,7 +198,7 @@ def light_on_grooves(
 
 
 def groove_table(distribution: AbstractMicrofacet) -> None:
-    """Print what the dial buys on grooves, against 40 x 40."""
+    """Print the accuracy of `FacetQuadrature` on grooves, against 40 x 40."""
     at = np.array([(*r, t, z) for r, t, z in itertools.product(GROOVES, AZIMUTH, GROOVE_ZENITH)])
     click.echo(f"\n{distribution!r}, grooves\n")
     click.echo("| along x across | facets | " + " | ".join(INTEGRALS) + " | brightness |")

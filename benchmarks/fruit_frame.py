@@ -1,4 +1,4 @@
-"""The fruit frame: which light of it comes from surfaces, which from below, and from what lamp.
+"""The fruit frame: light of surfaces, light from below, and the polarization of the lamp.
 
     python benchmarks/fruit_frame.py FRAME [--map fruit.zarr] [--picture fruit.png]
 
@@ -29,7 +29,7 @@ def fruit_capture(frame: Path, bin_: int = 16, window: int = 1) -> xr.Dataset:
 
 
 def of_the_lamp(frame: Path, row: float, column: float, reach: int) -> tuple[float, float]:
-    """Polarization of what a highlight adds to the light of the skin around it.
+    """Polarization of the light that a highlight adds to the skin around it.
 
     Brightness of glints changes over few pixels, that of the body over many: the Stokes parameters
     are regressed on brightness beside a smooth surface of second order.

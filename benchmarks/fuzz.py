@@ -1,4 +1,4 @@
-"""Malformed input of every kind: what becomes of it, counted.
+"""Outcomes of malformed input of every kind, counted.
 
     python benchmarks/fuzz.py                   20,000 cases of seven families
     python benchmarks/fuzz.py --share 0.02      a fiftieth of them
@@ -67,7 +67,7 @@ Case = Callable[[Random], str]
 
 
 def contract(capture: xr.Dataset) -> str:
-    """What was accepted, checked once more in other words than the package's."""
+    """Check accepted input once more, independently of the package's checks."""
     try:
         assert_inside_contract(capture)
     except AssertionError:
@@ -76,7 +76,7 @@ def contract(capture: xr.Dataset) -> str:
 
 
 def judged(case: Case, random: Random) -> tuple[str, str]:
-    """The outcome of a case, and the end of the traceback where there is one."""
+    """Return the outcome of a case, and the end of the traceback if there is one."""
     try:
         return case(random), ""
     except pb.PolarBayesError as error:
@@ -328,7 +328,7 @@ FAMILIES: dict[str, tuple[int, Callable[[Path], Case]]] = {
 
 
 class Reader:
-    """A subprocess that reads files of the netCDF library and says what came of each."""
+    """A subprocess that reads files by the netCDF library and reports the outcome of each."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -361,7 +361,7 @@ class Reader:
 
 
 def read_on(folder: Path) -> None:
-    """What the subprocess does: read the files that standard input names."""
+    """Read the files that standard input names, in the subprocess."""
     reads = dict(zip(FILES, (pb.load_capture, pb.load, pb.load_capture), strict=True))
     whole = {name: read(folder / name) for name, read in reads.items()}
     print("ready", flush=True)

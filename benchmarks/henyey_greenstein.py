@@ -134,7 +134,7 @@ def fitted() -> np.ndarray:
 
 
 def errors(g: float, albedo: float) -> dict[str, float]:
-    """Of `HenyeyGreenstein` without an interface, relative to the solution."""
+    """Errors of `HenyeyGreenstein` without an interface, relative to the solution."""
     turns, total = TURNS[::8], np.add.outer(COSINES, COSINES)
     # The first order of scattering needs more orders in azimuth than the others.
     across = np.multiply.outer(np.outer(SINES, SINES), np.cos(turns))

@@ -1,4 +1,4 @@
-"""How many files of the package a public function needs: the closure of its imports.
+"""Number of files of the package that a public function needs: the closure of its imports.
 
     python benchmarks/import_closure.py                 every verb
     python benchmarks/import_closure.py fit --list      the files that `polar_bayes.fit` needs
@@ -48,7 +48,7 @@ def imports(path: Path, known: dict[str, Path]) -> set[str]:
 
 
 def closure(module: str) -> list[str]:
-    """The module, everything that it imports, and so on."""
+    """Return the module, everything that it imports, and so on."""
     known, found, waiting = modules(), set(), [module]
     while waiting:
         name = waiting.pop()

@@ -1,4 +1,4 @@
-"""How often the intervals of a map hold the truth, with and without the correction by weights.
+"""Coverage of the intervals of a map, with and without the correction by weights.
 
     python benchmarks/map_coverage.py plates camera shared
 
@@ -60,7 +60,7 @@ def camera_image(gain: float | None, seed: int = 1) -> xr.Dataset:
 
 
 def camera() -> None:
-    """Print how often intervals of good pixels hold the truth, by the true roughness."""
+    """Print the coverage of good pixels by true roughness."""
     for gain, shared in ((None, ()), (0.93, SHARED), (1.0, SHARED), (1.0, None), (1.0, ())):
         image, begun = camera_image(gain), time.perf_counter()
         maps = pb.fit_pixels(image, shared=shared)
@@ -87,7 +87,7 @@ FACTOR = "stokes_error_factor"
 
 
 def hold_means(maps: xr.Dataset, image: xr.Dataset) -> dict[str, int]:
-    """How many square regions have means within their intervals."""
+    """Count the square regions whose means lie within their intervals."""
     at = np.arange(SIDE) * BLOCKS // SIDE
     labels = 1 + BLOCKS * at[:, None] + at
     found = pb.maps.region_means(maps, labels)
@@ -102,7 +102,7 @@ def hold_means(maps: xr.Dataset, image: xr.Dataset) -> dict[str, int]:
 
 
 def shared() -> None:
-    """Print how often intervals of the noise and of n hold the truth, over many images."""
+    """Print the coverage of intervals of the noise and of n, over many images."""
     random, links = np.random.default_rng(5), {"q": pb.links.StokesLink(stated_errors=True)}
     asked = {"scene": ASKED["scene"], "links": links}
     held, scores, pixels, regions, widths = [], [], [], [], []
@@ -133,7 +133,7 @@ def shared() -> None:
 
 
 def plates() -> None:
-    """Print how often intervals of smooth plates hold the truth."""
+    """Print the coverage of intervals of smooth plates."""
     noise = np.exp(np.random.default_rng(2).uniform(np.log(0.005), np.log(0.08), (SIDE, SIDE)))
     image = plate_image(SIDE, SIDE, noise=noise, seed=12)
     for name, method in METHODS.items():

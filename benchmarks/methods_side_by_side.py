@@ -1,4 +1,4 @@
-"""Which methods of many captures are needed: the same captures from the priors, fitted by each.
+"""Comparison of methods for many captures: the same captures from the priors, fitted by each.
 
     python benchmarks/methods_side_by_side.py --simulations 300
     python benchmarks/methods_side_by_side.py --only camera --simulations 100

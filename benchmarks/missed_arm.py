@@ -1,4 +1,4 @@
-"""An arm of the posterior that chains miss: river water under a sky, by NUTS and by importance.
+"""A long tail of the posterior that chains miss: river water under a sky, by NUTS and importance.
 
     POLAR_BAYES_DATA=FOLDER python benchmarks/missed_arm.py --seeds 4
 

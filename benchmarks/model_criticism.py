@@ -1,4 +1,4 @@
-"""False alarms and power of the verdict: right models, and worlds that the fitted scene lacks.
+"""False alarms and power of the verdict: correct models, and effects that the scene lacks.
 
     python benchmarks/model_criticism.py right --fits 334    share of right models flagged
     python benchmarks/model_criticism.py perfect --fits 334  the same of bare, perfect set-ups
@@ -66,7 +66,7 @@ class Mirrored(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class World:
-    """What is simulated, what happens to the readings, and the set-up that is fitted."""
+    """A simulated scene, a change of the readings, and the set-up that is fitted."""
 
     setup: str
     preset: str = "plastic"
@@ -334,7 +334,7 @@ WRONG: dict[str, World] = {
 
 
 def judge(capture: xr.Dataset, truth: Mapping[str, float], **settings: Any) -> dict[str, Any]:
-    """One fit: what its verdict says, and by how many sds it misses."""
+    """Fit once; return the verdict, and by how many sds an interval misses."""
     result = pb.fit(capture, **settings)
     table, found = criticize(result), pb.verdict(result)
     summary = pb.summary(result)
@@ -513,7 +513,7 @@ def wilson(hits: int, count: int) -> str:
 
 
 def main() -> None:
-    """Run what is asked for, and print the table of all that is kept."""
+    """Run the selected cases, and print the table of all results."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )

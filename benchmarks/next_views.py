@@ -1,4 +1,4 @@
-"""Views chosen by `next_views` beside random and equally spaced ones, on materials of known truth.
+"""Views chosen by `next_views` against random and equally spaced ones, with known truth.
 
     python benchmarks/next_views.py           200 materials
     python benchmarks/next_views.py 50        fewer
@@ -125,7 +125,7 @@ class Designer:
         self.unit = np.asarray(values).std(axis=0)[self.rows]
 
     def choose(self, z: np.ndarray, criterion: Any) -> tuple[Selection, np.ndarray]:
-        """The views, and the sds that they promise."""
+        """Return the chosen views, and the expected sds."""
         each, slopes = (np.asarray(x) for x in self.told(jnp.asarray(z)))
         slopes = slopes[:, None, self.rows]
         center = np.asarray(self.curvature(jnp.asarray(np.median(z, axis=0))))

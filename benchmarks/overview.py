@@ -1,4 +1,4 @@
-"""The picture on the landing page and in the README: what comes out of a fit.
+"""The picture on the landing page and in the README: the results of a fit.
 
     python benchmarks/overview.py [--out docs/figures/overview.png]
 
@@ -25,7 +25,7 @@ FIGURES = Path(__file__).parents[1] / "docs" / "figures"
 
 
 INDEX = 1.52
-"""Of the simulated plate."""
+"""Refractive index of the simulated plate."""
 
 
 def fitted_plate() -> xr.DataTree:

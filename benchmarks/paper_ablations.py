@@ -1,4 +1,4 @@
-"""What each part of the paper's model is worth: fits that leave it out, on the same data."""
+"""Ablations of the paper's model: fits that leave out one part, on the same data."""
 
 import dataclasses
 import math
@@ -90,7 +90,7 @@ def noise(
     told: Mapping[str, AbstractLink],
     fitted: Mapping[str, Mapping[str, AbstractLink]],
 ) -> None:
-    """The same simulations by the links that told them, and by others."""
+    """Fit the same simulations by the links that generated them, and by others."""
     capture = layout()
     found: dict[str, list[xr.DataTree]] = {
         label: [
@@ -125,7 +125,7 @@ def _against(own: NormalScores, first: NormalScores, same: bool) -> tuple[str, s
 
 
 def pooling(study: Study) -> None:
-    """The index of plates of one batch: from one population, or each for itself."""
+    """Fit the index of plates of one batch, pooled and separately."""
     found: dict[str, list[NormalScores]] = {"per_material": [], "hierarchical": []}
     converged = dict.fromkeys(found, 0)
     for repetition in range(REPETITIONS):

@@ -1,4 +1,4 @@
-"""Three pictures: readings and what is predicted of them, grazing views, calibration by method."""
+"""Three figures: readings and predictions, grazing views, calibration by method."""
 
 from pathlib import Path
 

@@ -103,7 +103,7 @@ def _each(program: Program, own: Any, shared: Any, starts: Array) -> tuple[Estim
 
 
 def scores_of(found: Found, truth: np.ndarray, name: str) -> NormalScores:
-    """Scores of least squares; what did not converge has no answer."""
+    """Scores of least squares; fits that did not converge have no answer."""
     value = np.where(found.converged, found.value[name], np.nan)
     reach = NORMAL_95 * np.where(found.converged, found.error[name], np.nan)
     return score(value, value - reach, value + reach, truth)
@@ -117,7 +117,7 @@ def check_same(drawn: Simulations, tree: xr.DataTree) -> None:
 
 
 def compared(study: Study) -> tuple[str, ...]:
-    """The methods of every comparison, and the one that was asked for."""
+    """Return the methods of every comparison, and the selected one."""
     return tuple(dict.fromkeys((*USUAL, study.method)))
 
 

@@ -1,4 +1,4 @@
-"""What the paper's evaluation is made of here: classes of materials, the protocol, and scores.
+"""Definitions of the paper's evaluation: classes of materials, the protocol, and scores.
 
 A class is a narrow population around a preset. Truths are drawn from it, the fits believe the
 paper's priors: what they get wrong is what the wide prior costs where materials are alike.
@@ -26,7 +26,7 @@ from polar_bayes.simulation import BRIGHT_LEVEL, BRIGHT_QUANTILE, NOISE
 CLASSES = tuple(pb.simulation.PRESETS)
 NAMES = ("roughness", "subsurface_fraction", "absorption", "refractive_index")
 PAPER = dataclasses.replace(pb.setups.SETUPS["paper"], scene=SCENE, priors={})
-"""With the paper's own priors: the set-up of that name leaves more room for a bare surface."""
+"""The set-up with the paper's own priors; the set-up `paper` allows more for a bare surface."""
 INDEX = "refractive_index"
 COLOR = 550.0
 LARGEST, GRAZING = 85.0, 75.0
@@ -43,7 +43,7 @@ SPREADS = {
 
 @dataclasses.dataclass(frozen=True)
 class Study:
-    """What the command line asks for.
+    """Options of the command line.
 
     Args:
         simulations: Of each cell of a table.
@@ -114,14 +114,14 @@ def around(middle: Mapping[str, Any]) -> dict[str, dist.Distribution]:
 
 
 def exposure(parameters: Mapping[str, Any], scene: pb.Scene = SCENE) -> Array:
-    """As `simulate` would choose it for the whole protocol, whichever views are taken of it."""
+    """Return the exposure that `simulate` would choose for the whole protocol."""
     geometry = pb.Geometry.from_degrees(**pb.simulation.Protocol(wavelengths=()).angles())
     seen = scene.predict({n: jnp.asarray(x) for n, x in parameters.items()}, geometry)
     return BRIGHT_LEVEL / jnp.quantile(seen["intensity"], BRIGHT_QUANTILE)
 
 
 class NormalScores(NamedTuple):
-    """How one parameter of every simulation came out, (simulation,); NaN without an answer.
+    """Scores of one parameter of every simulation, (simulation,); NaN without an answer.
 
     Args:
         error: Size of estimate minus truth.
@@ -150,7 +150,7 @@ def scores(tree: xr.DataTree, name: str) -> NormalScores:
 
 
 def told(trees: list[xr.DataTree]) -> str:
-    """How many fits have no answer, and how many have one that is doubted."""
+    """Count the fits without an answer, and those with an answer in doubt."""
     missing, doubted, every = 0, 0, 0
     for tree in trees:
         status = tree["fits"]["status"].to_numpy()
@@ -162,7 +162,7 @@ def told(trees: list[xr.DataTree]) -> str:
 
 
 def joined(parts: list[NormalScores]) -> NormalScores:
-    """Those of several classes as one."""
+    """Join the results of several classes."""
     return NormalScores(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 

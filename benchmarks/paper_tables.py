@@ -131,7 +131,7 @@ class Information:
         )
 
     def eigenvalues(self, truth: xr.Dataset) -> Eigenvalues:
-        """At the truths of simulations."""
+        """Return eigenvalues at the truths of simulations."""
         program = self.program
         with jax.enable_x64(True):
             z = unconstrain(program, {name: truth[name].to_numpy() for name in program.supports})
@@ -159,7 +159,7 @@ def _smallest(matrix: np.ndarray, scale: np.ndarray) -> np.ndarray:
 
 
 def _at(program: Program, z: Array, data: Observations) -> tuple[Array, Array, Array]:
-    """The paper's and the whole information about the coordinates, and what these move."""
+    """Return the paper's and the whole information, and the derivatives of the coordinates."""
     seen = program.describe(jax.random.key(0), z, data).center["intensity"]
     # Full scale is that of the sensor, not that of the views at hand.
     data = dataclasses.replace(data, brightness=jnp.clip(seen, 0.0, 1.0))
@@ -219,7 +219,7 @@ def _summary(own: NormalScores, values: Eigenvalues) -> tuple:
 
 
 def _differences(pairs: list) -> tuple:
-    """Of width, error, coverage and eigenvalues, over all simulations of some classes."""
+    """Differences of width, error, coverage and eigenvalues, over simulations of some classes."""
 
     def both(take) -> tuple[np.ndarray, np.ndarray]:
         new, old = ([take(each[at]) for each in pairs] for at in (0, 1))

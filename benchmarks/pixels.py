@@ -1,4 +1,4 @@
-"""Pixels per second, side by side in one run: peers, ours, and what each answer is worth.
+"""Pixels per second of this package and its peers in one run, with the accuracy of each.
 
     python benchmarks/pixels.py            40 views, four parameters
     python benchmarks/pixels.py 100000     the same, with so many pixels of ours
@@ -80,7 +80,7 @@ def image(side: int) -> xr.Dataset:
 
 
 def rate(count: int, run: Callable[[], Any]) -> tuple[float, Any]:
-    """Pixels per second of the second run, and what it found."""
+    """Return pixels per second of the second run, and its result."""
     run()
     start = time.perf_counter()
     found = run()

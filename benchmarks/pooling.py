@@ -1,4 +1,4 @@
-"""What pooling buys, what it costs, and how its cost grows.
+"""Benefit and cost of pooling, and how the cost grows.
 
     python benchmarks/pooling.py alike        hierarchical against separate fits
     python benchmarks/pooling.py different    the same, where members truly differ

@@ -1,4 +1,4 @@
-"""What simulation-based calibration would catch: how often it fails models broken on purpose.
+"""Power of simulation-based calibration: how often it detects models broken on purpose.
 
     python benchmarks/power.py                    1000 simulations of each model
     python benchmarks/power.py 400                fewer
@@ -74,7 +74,7 @@ BROKEN: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 def fails(calibration: xr.DataTree) -> tuple[bool, bool]:
-    """Whether the test of the parameters fails, and that of the readings."""
+    """Return whether the test of the parameters fails, and that of the readings."""
     tables = (
         pb.summary(calibration),
         pb.calibration.calibration_readings(calibration),

@@ -1,4 +1,4 @@
-"""What the first fit of a layout costs, and what the next one of other readings does.
+"""Cost of the first fit of a layout, and of the next fit of other readings.
 
     python benchmarks/second_fit.py
     python benchmarks/second_fit.py "map, nothing shared"

@@ -1,4 +1,4 @@
-"""Do intervals hold where the set-up is off by what it is known to, and where it is perfect?
+"""Coverage of intervals with errors of the set-up as large as stated, and in a perfect set-up.
 
     python benchmarks/setup_budget.py camera --captures 90
 

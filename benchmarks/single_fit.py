@@ -1,4 +1,4 @@
-"""What a fit of one material costs: the next one in a session, and a command of its own.
+"""Cost of a fit of one material: the next one in a session, and a separate command.
 
     python benchmarks/single_fit.py                  four fits, three commands
     python benchmarks/single_fit.py --fits 10 --commands 0

@@ -1,4 +1,4 @@
-"""Light that walks over a rough surface by Smith's model: what two bounces and a body miss of it.
+"""Light that walks over a rough surface by Smith's model: errors of two bounces and of bodies.
 
     python benchmarks/smith_walk.py              the tables of docs/scenes.md
     python benchmarks/smith_walk.py --write F    transmittances and their errors, as a table
@@ -91,7 +91,7 @@ def mirrored(ray: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 
 def free_after(zenith: float, roughness: float, count: int, seed: int = 1) -> np.ndarray:
-    """Share of rays that leave after one bounce, two, three and more."""
+    """Return the share of rays that leave after one bounce, two, three and more."""
     random, walk, left = np.random.default_rng(seed), arrive(zenith, count), []
     for _ in range(4):
         height = next_facet(walk, roughness, random)

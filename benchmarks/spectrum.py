@@ -1,4 +1,4 @@
-"""Real materials at colors that were not measured, and what many colors cost.
+"""Real materials at colors that were not measured, and the cost of many colors.
 
     python benchmarks/spectrum.py [bands] [coverage] [colors]
 
@@ -62,7 +62,7 @@ def bands() -> None:
 
 
 def coverage() -> None:
-    """How many bands of many replicates hold the truth."""
+    """Count the bands of many replicates that contain the truth."""
     inside = []
     for seed in range(100, 100 + REPLICATES):
         for material in tabulated().values():

@@ -1,4 +1,4 @@
-"""Whether a shorter warm-up of NUTS costs anything but time: six scenes and two populations.
+"""Effect of a shorter warm-up of NUTS: six scenes and two populations.
 
     python benchmarks/warmup.py                      300 (the default), 200 and 100 draws
     python benchmarks/warmup.py --lengths 300 250 --cases "leaf, 40 views"
@@ -65,7 +65,7 @@ def chains_of(result: xr.DataTree) -> np.ndarray:
 
 
 def look(result: xr.DataTree) -> dict[str, float | np.ndarray]:
-    """What is told of one fit."""
+    """Return diagnostics of one fit."""
     draws, stats = chains_of(result), result["sample_stats"]
     mixing, steps = measure(draws), stats["n_steps"].values
     before = int(stats["warmup_steps"].isel(draw=0).sum())

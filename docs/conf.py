@@ -1,4 +1,4 @@
-"""How Sphinx builds these pages: `sphinx-build -W -n docs site`.
+"""Configuration of Sphinx for these pages: `sphinx-build -W -n docs site`.
 
 With `-t online`, names of other projects are links to their documentation.
 """
@@ -100,14 +100,14 @@ html_theme_options = {
 
 
 def draw_formula(page: HTML5Translator, node: nodes.math | nodes.math_block) -> None:
-    """A formula as MathML, which browsers draw without a script from elsewhere."""
+    """Return a formula as MathML, which browsers draw without an external script."""
     display = "block" if isinstance(node, nodes.math_block) else "inline"
     page.body.append(convert(node.astext(), display=display))
     raise nodes.SkipNode
 
 
 def write_formulas_as_in_sphinx(*event: object) -> None:
-    """`$x$` and `$$ x $$` of a docstring become a role and a directive of Sphinx."""
+    """Turn `$x$` and `$$ x $$` of a docstring into a role and a directive of Sphinx."""
     lines = event[-1]
     text = re.sub(r"( *)\$\$(.+?)\$\$", _directive, "\n".join(lines), flags=re.DOTALL)
     lines[:] = re.sub(r"\$([^$]+)\$", _role, text).split("\n")
@@ -122,6 +122,6 @@ def _role(found: re.Match[str]) -> str:
 
 
 def setup(app: Sphinx) -> None:
-    """Sphinx calls it."""
+    """Register the extensions of this file; Sphinx calls this function."""
     app.add_html_math_renderer("mathml", (draw_formula, None), (draw_formula, None))
     app.connect("autodoc-process-docstring", write_formulas_as_in_sphinx)

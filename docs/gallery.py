@@ -2,8 +2,8 @@
 # # Gallery
 #
 # Twelve pictures, each with the lines that make it. All captures are simulated, so the truth is
-# known, and the settings are small, so that a laptop draws each picture in less than a minute.
-# The colors are those of Okabe and Ito, which color-blind people can tell apart.
+# known, and the settings are small, so that a laptop draws each picture in less than a minute. The
+# colors are those of Okabe and Ito, which color-blind people can distinguish.
 #
 # The first capture is a plastic under a lamp, seen by a polarization camera from 40 directions.
 
@@ -22,7 +22,7 @@ plastic = pb.simulate("plastic", scene="camera", protocol=protocol, seed=1)
 # ## Readings and the bands of a fit
 #
 # Half of new readings should fall in the dark band, and 95% in the light one. Readings that lie
-# outside [speak against the model](criticism.md).
+# outside [contradict the model](criticism.md).
 
 # %% mystnb={"image": {"alt": "Signed polarization against view zenith, with two bands of the fit"}}
 fit = pb.fit(plastic, method="importance", seed=0)
@@ -31,8 +31,8 @@ pb.plots.plot_readings(fit, "q")
 # %% [markdown]
 # ## What a capture determines
 #
-# The bars show which share of a parameter's variance the prior decides. Near 1 the readings say
-# nothing about it, and its interval is [the prior's](identifiability.md).
+# The bars show which share of a parameter's variance comes from the prior. Near 1 the readings add
+# nothing, and the interval is [that of the prior](identifiability.md).
 
 # %% mystnb={"image": {"alt": "Bars of the prior's share of the variance of each parameter"}}
 found = pb.identify(plastic)
@@ -77,7 +77,7 @@ plt.show()
 # ## Where to look next
 #
 # Of all directions in the measured azimuths, these would narrow the interval of the index most,
-# and the curve shows [by how much](identifiability.md#choosing-further-views).
+# and the curve shows [by how much](identifiability.md#choosing-further-views-optimal-design).
 
 # %% mystnb={"image": {"alt": "Expected width of the interval of the index after each added view"}}
 index = pb.design.SingleParameter("refractive_index")
@@ -99,7 +99,7 @@ plt.show()
 # ## A map and its widths
 #
 # Every pixel of an image has its own posterior: the mean, its standard deviation, and a status that
-# says [how far it can be trusted](maps.md). The corner at the top left is dark and noisy, so its
+# shows [whether it is reliable](maps.md). The corner at the top left is dark and noisy, so its
 # intervals are wide.
 
 # %% mystnb={"image": {"alt": "Maps of the mean and the standard deviation of each parameter"}}
@@ -116,8 +116,9 @@ pb.plots.plot_maps(maps)
 # %% [markdown]
 # ## Means of regions
 #
-# The mean over a region has an interval of its own. It is much narrower than that of a pixel,
-# because [errors of pixels are independent](maps.md#regions) but for what they share.
+# The interval of the mean over a region is much narrower than that of a pixel, because
+# [errors of pixels are independent](maps.md#means-and-contrasts-of-regions), except for errors of
+# shared parameters.
 
 # %% mystnb={"image": {"alt": "Error of the mean index of three regions, with intervals"}}
 labels = np.where(noise["stokes_scale"] > 0.002, "dark", np.where(x < 16, "left", "right"))
@@ -135,9 +136,9 @@ plt.show()
 # %% [markdown]
 # ## What each effect changes
 #
-# The second capture is a plate of glass on a goniometer. Each bar leaves out one effect of the
-# instrument and says how far the answer moves then. Effects beyond the dashed line
-# [have to stay](effects.md).
+# The second capture is a plate of glass on a goniometer. Each bar shows how far the result moves
+# without one effect of the instrument. Effects beyond the dashed line [have to be
+# kept](effects.md).
 
 # %% mystnb={"image": {"alt": "Bars of the change of the posterior without each effect"}}
 few = pb.simulation.Protocol(views=14, wavelengths=())
@@ -151,9 +152,9 @@ plt.show()
 # %% [markdown]
 # ## Which scene?
 #
-# Scenes from simple to complex are fitted to the same readings. The weight says how well each would
-# predict new ones, and `pb.fit(glass, scene="auto")`
-# [stacks the answers of those that remain](which_scene.md).
+# Scenes from simple to complex are fitted to the same readings. The weight shows how well each
+# would predict new ones, and `pb.fit(glass, scene="auto")` [stacks the answers of those that
+# remain](which_scene.md).
 
 # %% mystnb={"image": {"alt": "Bars of the weight of each scene"}}
 compared = pb.compare_scenes(glass)
@@ -189,8 +190,8 @@ pb.plots.plot_calibration(calibration)
 # %% [markdown]
 # ## An index between measured colors
 #
-# Three colors are coupled by a Gaussian process, which says what is known at
-# [every wavelength between them](spectral.md).
+# Three colors are coupled by a Gaussian process, which gives a posterior at [every wavelength
+# between them](spectral.md).
 
 # %% mystnb={"image": {"alt": "Index against wavelength: band of the coupled fit and true values"}}
 three = pb.simulation.Protocol(views=12, wavelengths=(450.0, 550.0, 650.0))

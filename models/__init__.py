@@ -1,4 +1,4 @@
-"""The declarative models, one file each. Copy one, edit it, and pass it to `polar_bayes.fit`."""
+"""Declarative models, one per file. Copy one, edit it, and pass it to `polar_bayes.fit`."""
 
 from polar_bayes.namespace import attach
 

@@ -68,7 +68,7 @@ class GpSpectral(HTMLRepr):
         check_processes(self.coupled, self.process)
 
     def process_of(self, name: str) -> SpectralProcess:
-        """The process of one spectrum."""
+        """Return the process of one spectrum."""
         if isinstance(self.process, tuple):
             return self.process[self.coupled.index(name)]
         return self.process
@@ -91,7 +91,7 @@ class GpSpectral(HTMLRepr):
     def _spectrum(
         self, name: str, data: Observations, priors: Priors
     ) -> Float[Array, "... wavelength"]:
-        """Sample one spectrum, for each patch its own."""
+        """Sample one spectrum, separately for each patch."""
         process, wavelength = self.process_of(name), wavelengths_of(data)
 
         # Amplitude and length of the variation over wavelength: one each for the capture.

@@ -39,16 +39,16 @@ from polar_bayes.repr_html import HTMLRepr
 
 
 class Scale(NamedTuple):
-    """The scale on which a population is normal."""
+    """A scale on which a population is normal."""
 
     population: Callable[[Array, Array], dist.Distribution]
-    """From location and spread to the distribution of a member's coordinate on this scale."""
+    """Function from location and spread to the distribution of a member's coordinate."""
     value: Callable[[Array], Array]
-    """From the coordinate of a member to the parameter in its own unit."""
+    """Function from the coordinate of a member to the parameter in its own unit."""
 
 
 def natural_scale(name: str, location: dist.Distribution) -> Scale:
-    """The scale of a parameter by its physical range: log, log odds, or the parameter itself."""
+    """Return the scale of a parameter by its physical range: log, log odds or identity."""
     limits = RANGES.get(name, (-math.inf, math.inf))
     if limits == (0.0, math.inf):
         return Scale(lambda center, spread: dist.Normal(jnp.log(center), spread), jnp.exp)
@@ -95,7 +95,7 @@ def draw_pooled(
 
 
 def check_pooled(pooled: object, *, where: str) -> None:
-    """Refuse a choice of pooled parameters that is no tuple of parameters of a material."""
+    """Refuse a choice of pooled parameters that is not a tuple of material parameters."""
     if not isinstance(pooled, tuple) or not all(isinstance(name, str) for name in pooled):
         hint = "write pooled=('refractive_index',), with the comma"
         raise FitError(f"pooled={pooled!r} is no tuple of names", where=where, hint=hint)
@@ -107,7 +107,7 @@ def check_pooled(pooled: object, *, where: str) -> None:
 
 
 def check_members(pooled: tuple[str, ...], data: Observations, scene: Scene) -> None:
-    """Refuse to pool what the scene does not read, or a capture with a single member."""
+    """Refuse to pool parameters that the scene lacks, or a capture with a single member."""
     possible = [name for name in MATERIAL_PARAMETERS if name in scene.parameters]
     missing = [name for name in pooled if name not in possible]
     if missing:

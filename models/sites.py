@@ -27,7 +27,7 @@ SPECTRAL = ("absorption", "refractive_index")
 
 @contextlib.contextmanager
 def over_axes(data: Observations, *, without: tuple[str, ...] = ()) -> Iterator[None]:
-    """Plates over every axis of the capture except those named."""
+    """Enter plates over every axis of the capture except those named."""
     with contextlib.ExitStack() as stack:
         for position, (name, length) in enumerate(data.dims):
             if name not in without:
@@ -36,7 +36,7 @@ def over_axes(data: Observations, *, without: tuple[str, ...] = ()) -> Iterator[
 
 
 def material_parameters(scene: Scene) -> tuple[str, ...]:
-    """The parameters of the material that a scene reads; no others are sampled."""
+    """Return the material parameters that a scene reads; no others are sampled."""
     return tuple(name for name in MATERIAL_PARAMETERS if name in scene.parameters)
 
 
@@ -52,17 +52,17 @@ def draw(name: str, prior: dist.Distribution, data: Observations) -> Float[Array
 
 
 def _sample(name: str, prior: dist.Distribution) -> Array:
-    """Sample a parameter of a scene, and say whether readings know it by a sum only."""
+    """Sample a parameter, marked if readings determine only a sum that contains it."""
     return numpyro.sample(name, prior, infer={"summed": name in UNPOLARIZED})
 
 
 def drop_view(value: Float[Array, "..."], data: Observations) -> Float[Array, "..."]:
-    """A parameter without the view axis of length 1 that plates left behind."""
+    """Remove the view axis of length 1 that plates added."""
     return value[..., 0] if len(data.dims) > 1 and value.ndim == len(data.dims) else value
 
 
 def constant_axes(name: str) -> tuple[str, ...]:
-    """The axes of a capture over which a parameter of a material stays the same."""
+    """Return the axes of a capture along which a material parameter is constant."""
     return ("view",) if name in SPECTRAL else ("wavelength", "view")
 
 
@@ -70,11 +70,11 @@ def constant_axes(name: str) -> tuple[str, ...]:
 
 
 HINGES = 80.0
-"""Width of the interval over that of the bend at a bound."""
+"""Ratio of the width of the interval to that of the bend at a bound."""
 
 
 class SoftClip(Transform):
-    r"""The identity inside an interval, bent at its ends.
+    r"""Transform that is the identity inside an interval and bends at its ends.
 
     $$ y = l + s \log\frac{1 + e^{(x-l)/s}}{1 + e^{(x-h)/s}}, \qquad s = (h-l)/80 $$
 
@@ -91,7 +91,7 @@ class SoftClip(Transform):
 
     @property
     def scale(self) -> float:
-        """s, in the unit of the parameter."""
+        """Scale s of the bend, in the unit of the parameter."""
         return (self.high - self.low) / HINGES if math.isfinite(self.high) else 1.0 / HINGES
 
     @property

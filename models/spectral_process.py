@@ -20,7 +20,7 @@ Knots = Float[Array, " knots"]
 Wavelengths = Float[Array, " wavelength"]
 
 KERNELS = ("Exp", "ExpSquared", "Matern32", "Matern52")
-"""The decaying kernels of tinygp whose only parameter is a length."""
+"""Decaying kernels of tinygp whose only parameter is a length."""
 
 LEAST_NUGGET = 1e-10
 
@@ -84,17 +84,17 @@ class SpectralProcess(HTMLRepr):
 
     @property
     def fits_length(self) -> bool:
-        """False where the kernel is an object, which has a length of its own."""
+        """True if the length is fitted; False if the kernel is an object with its own length."""
         return not isinstance(self.kernel, kernels.Kernel)
 
     def knot_wavelengths(self, wavelength: Wavelengths) -> Knots:
-        """The knots of these measured wavelengths in ascending order, nm."""
+        """Return the knots of measured wavelengths in ascending order, nm."""
         if wavelength.size <= self.knots:
             return jnp.sort(wavelength)
         return jnp.linspace(jnp.min(wavelength), jnp.max(wavelength), self.knots)
 
     def scales(self, length: Array | None, knot_wavelengths: Knots) -> Knots:
-        """How much each weight moves the values at the knots, given those before it. 1, > 0."""
+        """Return the conditional sd of the values at the knots by each weight. 1, > 0."""
         return jnp.diag(self._factor(length, knot_wavelengths))
 
     def values(
@@ -104,7 +104,7 @@ class SpectralProcess(HTMLRepr):
         knot_wavelengths: Knots,
         wavelength: Wavelengths,
     ) -> Float[Array, "... wavelength"]:
-        """The process at any wavelengths, as far as its knots determine it.
+        """Return the process at any wavelengths, as far as its knots determine it.
 
         Args:
             weights: w, standard normal. (..., knots), 1.
@@ -120,7 +120,7 @@ class SpectralProcess(HTMLRepr):
     def remainder(
         self, length: Array | None, knot_wavelengths: Knots, wavelength: Wavelengths
     ) -> Float[Array, "wavelength wavelength"]:
-        """Lower Cholesky factor of the covariance that the knots leave undetermined.
+        """Return the lower Cholesky factor of the covariance that the knots leave undetermined.
 
         Args:
             length: Length of the kernel, or None where it is an object. nm, > 0.
@@ -138,7 +138,7 @@ class SpectralProcess(HTMLRepr):
         return jnp.linalg.cholesky(left + self._nugget(prior, NUGGET_OF_REMAINDER))
 
     def _across(self, length: Array | None, knot_wavelengths: Array, wavelength: Array) -> Array:
-        """What each weight does to the values at these wavelengths: (knots, wavelength)."""
+        """Return the effect of each weight on the values at wavelengths, (knots, wavelength)."""
         across = self._matrix(length, knot_wavelengths, wavelength)
         turned = _polynomials(knot_wavelengths).T @ across
         return solve_triangular(self._factor(length, knot_wavelengths), turned, lower=True)
@@ -149,7 +149,7 @@ class SpectralProcess(HTMLRepr):
         return jnp.linalg.cholesky(turn.T @ (covariance + self._nugget(covariance)) @ turn)
 
     def _matrix(self, length: Array | None, first: Array, second: Array) -> Array:
-        """The kernel between two lists of wavelengths, in their precision."""
+        """Return the kernel matrix of two lists of wavelengths, in their precision."""
         if isinstance(self.kernel, str):
             kernel = getattr(kernels, self.kernel)(scale=length)
         else:
@@ -164,7 +164,7 @@ class SpectralProcess(HTMLRepr):
 
 
 def _polynomials(knots: Array) -> Array:
-    """Orthonormal polynomials over the knots, one a column, the constant last."""
+    """Return orthonormal polynomials over the knots as columns, the constant last."""
     # Householder's turn is orthogonal even where equal knots leave fewer polynomials.
     span = jnp.maximum(knots[-1] - knots[0], jnp.finfo(knots.dtype).tiny)
     inside = jnp.clip(2.0 * (knots - knots[0]) / span - 1.0, -1.0, 1.0)
@@ -184,7 +184,7 @@ TYPICAL_ERROR = {"refractive_index": 0.003, "absorption": 0.1}
 def spectrum_around(
     name: str, level: Array, amplitude: Array, departure: Array, bounds: tuple[float, float]
 ) -> Array:
-    r"""A spectrum from its level and its process.
+    r"""Return a spectrum from its level and its process.
 
     $$ n(\lambda) = T[l + A (f(\lambda) - \bar f)], \qquad
        a(\lambda) = l \exp(A (f(\lambda) - \bar f)) $$
@@ -200,7 +200,7 @@ def spectrum_around(
 
 
 def weight_scale(name: str, scales: Knots) -> Knots:
-    r"""By how much weights are widened before they are sampled.
+    r"""Return the factors by which weights are widened before they are sampled.
 
     $$ \sqrt{1 + (s_j/\sigma)^2}, \quad \text{and 1 for the last} $$
 
@@ -218,14 +218,14 @@ def weight_scale(name: str, scales: Knots) -> Knots:
 
 
 def wavelengths_of(data: Observations) -> Wavelengths:
-    """The wavelengths of a capture, nm."""
+    """Return the wavelengths of a capture, nm."""
     wavelength = data.geometry.wavelength
     assert wavelength is not None  # `check_capture` has seen the axis
     return jnp.ravel(wavelength)
 
 
 def check_spectra(coupled: object) -> None:
-    """Refuse what is no choice of spectra."""
+    """Refuse a value that is not a choice of spectra."""
     if not (
         isinstance(coupled, tuple) and 0 < len(coupled) == len(set(coupled).intersection(SPECTRA))
     ):

@@ -6,7 +6,7 @@ from typing import override
 
 
 class PolarBayesError(ValueError):
-    """Base of all errors that a user can correct; it can be pickled.
+    """Base class of errors that a user can correct; instances can be pickled.
 
     Args:
         what: What is wrong, as a clause without a full stop.
@@ -29,7 +29,7 @@ class CaptureError(PolarBayesError):
 
 
 class SceneError(PolarBayesError):
-    """The optics asked for do not exist or do not fit together."""
+    """The requested optics do not exist or are incompatible."""
 
 
 class FitError(PolarBayesError):
@@ -37,10 +37,10 @@ class FitError(PolarBayesError):
 
 
 class OutputError(PolarBayesError):
-    """An output cannot be written where it was asked for, or would destroy what is there."""
+    """An output cannot be written, or would overwrite something else."""
 
 
 def one_line(text: str) -> str:
-    """Text that stays on one line, whatever a file's names or attributes contain."""
+    """Return text without line breaks, whatever names and attributes of files contain."""
     printable = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
     return printable if len(printable) <= 400 else printable[:397] + "..."

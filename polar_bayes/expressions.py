@@ -1,4 +1,4 @@
-"""Values as the calls that make them: `Normal(0, 3)`, `StokesLink(degrees_of_freedom=4.0)`.
+"""Values as the expressions that make them: `Normal(0, 3)`, `StokesLink(degrees_of_freedom=4.0)`.
 
 Results, scene files and the command line state parts, links, priors and methods in this form, which
 is Python's own. A text is parsed by `ast`, and what it names is looked up in a table of known
@@ -15,13 +15,13 @@ from typing import Any, NoReturn
 from polar_bayes.errors import FitError, PolarBayesError, one_line
 
 Known = Mapping[str, Callable[..., object]]
-"""What a text may name: classes and functions by their names."""
+"""Classes and functions, by name, that a text may use."""
 
 
 def parse_value(
     text: object, known: Known, where: str, error: type[PolarBayesError] = FitError
 ) -> Any:
-    """The value that a text describes.
+    """Return the value that a text describes.
 
     Args:
         text: A call with literal arguments, or with such calls as arguments.
@@ -100,14 +100,14 @@ class _Parser:
 
 
 def _last_name(node: ast.AST) -> str:
-    """`Normal` of `Normal` and of `dist.Normal`; empty where there is no name."""
+    """Return `Normal` for `Normal` and `dist.Normal`; empty where there is no name."""
     if isinstance(node, ast.Attribute):
         return node.attr
     return node.id if isinstance(node, ast.Name) else ""
 
 
 def short_text(value: object) -> str:
-    """A part, link or method as the shortest call that makes it: fields at their defaults left out.
+    """Format a part, link or method as its shortest call, without fields at their defaults.
 
     Args:
         value: A frozen dataclass, a tuple of them, or a literal.
@@ -126,6 +126,6 @@ def short_text(value: object) -> str:
 
 
 def _default(field: dataclasses.Field) -> object:
-    """The default of a field; a value that equals nothing where there is none."""
+    """Return the default of a field, or a value that equals nothing."""
     made = field.default_factory
     return field.default if made is dataclasses.MISSING else made()

@@ -1,4 +1,4 @@
-"""Tables whose text shows every column, at the width of the terminal or at 80 characters."""
+"""Tables that print all their columns, at the width of the terminal or at 80 characters."""
 
 import shutil
 import sys
@@ -9,7 +9,7 @@ import pandas as pd
 type Frame = pd.DataFrame
 
 WIDTH = 80
-"""Characters of a line where the output is no terminal."""
+"""Characters per line where the output is not a terminal."""
 
 
 class PrintedFrame(pd.DataFrame):

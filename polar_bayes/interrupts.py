@@ -19,7 +19,7 @@ _LOCK = threading.Lock()
 
 @contextlib.contextmanager
 def on_interrupt(cleanup: Callable[[], str | None]) -> Iterator[None]:
-    """Register a cleanup while the block runs; it may return a sentence for the user."""
+    """Register a cleanup for the duration of a block; it may return a sentence to print."""
     with _LOCK:
         number = next(_NUMBERS)
         _CLEANUPS[number] = cleanup
@@ -31,7 +31,7 @@ def on_interrupt(cleanup: Callable[[], str | None]) -> Iterator[None]:
 
 
 def clean_up() -> list[str]:
-    """Run every cleanup, newest first, even if others fail; returns their sentences."""
+    """Run every cleanup, newest first, even if others fail; return their sentences."""
     with _LOCK:
         cleanups = [_CLEANUPS[number] for number in sorted(_CLEANUPS, reverse=True)]
         _CLEANUPS.clear()
@@ -43,5 +43,5 @@ def clean_up() -> list[str]:
 
 
 def resume_hint(path: Path) -> str:
-    """The sentence of a cleanup whose work can be resumed."""
-    return f"{path}: what is done is kept; repeat the command with --resume to go on"
+    """Return the cleanup sentence of work that can be resumed."""
+    return f"{path}: finished work is saved; repeat the command with --resume to continue"

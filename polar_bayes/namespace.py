@@ -1,4 +1,4 @@
-"""Names of a package, each loaded when it is first used, as the stub beside it declares them."""
+"""Lazy names of a package, as declared in its stub."""
 
 import contextlib
 import os
@@ -16,7 +16,7 @@ Attached = tuple[Callable[[str], object], Callable[[], list[str]], list[str]]
 
 
 def attach(package: str, file: str) -> Attached:
-    """`__getattr__`, `__dir__` and `__all__` of a package from its `__init__.pyi` (PEP 562)."""
+    """Return `__getattr__`, `__dir__` and `__all__` of a package from its stub (PEP 562)."""
     load, listed, names = lazy_loader.attach_stub(package, file)
 
     def load_guarded(name: str) -> object:
@@ -28,7 +28,7 @@ def attach(package: str, file: str) -> Attached:
 
 
 def force_numpyro_import() -> None:
-    """Load NumPyro where ArviZ, imported first, has left a lazy stand-in for it."""
+    """Load NumPyro where an earlier import of ArviZ left a lazy module in its place."""
     # `import numpyro.infer` on a stand-in runs NumPyro twice, and its modules no longer find each
     # other. Reading any attribute of the stand-in loads it once.
     stand_in = sys.modules.get("numpyro")
@@ -38,7 +38,7 @@ def force_numpyro_import() -> None:
 
 @contextlib.contextmanager
 def _quiet_compiler() -> Iterator[None]:
-    """Hide what XLA logs, such as alarms of slow compilation, where it is loaded now."""
+    """Hide logs of XLA, such as alarms of slow compilation, while it is loaded."""
     # It reads the variable when it is loaded, so that others find their environment unchanged.
     log_level = "TF_CPP_MIN_LOG_LEVEL"
     if log_level in os.environ or "jaxlib" in sys.modules:
@@ -53,7 +53,7 @@ def _quiet_compiler() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _callers_random_state() -> Iterator[None]:
-    """Undo what JAX (`numpy.random`) and Rich (`random`) draw from global states when imported."""
+    """Restore global random states, from which JAX and Rich draw when imported."""
     numpy_random = sys.modules.get("numpy.random")  # not there: nobody has seeded it
     state = random.getstate()
     numpy_state = None if numpy_random is None else numpy_random.get_state(legacy=False)

@@ -23,11 +23,11 @@ from polar_bayes.interrupts import on_interrupt
 PathLike = str | os.PathLike[str]
 
 TEMPORARY_PREFIX = ".polar-bayes-"
-"""Prefix of the temporary folders of unfinished outputs."""
+"""Prefix of temporary folders of unfinished outputs."""
 
 
 def as_path(path: PathLike, what: str, error: type[PolarBayesError] = CaptureError) -> Path:
-    """A path from a user's argument, not resolved."""
+    """Return a path from a user's argument, not resolved."""
     try:
         text = os.fspath(path)
     except TypeError:
@@ -38,7 +38,7 @@ def as_path(path: PathLike, what: str, error: type[PolarBayesError] = CaptureErr
 
 
 def existing_file(path: PathLike, what: str) -> Path:
-    """The path of an existing, non-empty file, not resolved."""
+    """Return the path of an existing, non-empty file, not resolved."""
     file = as_path(path, what)
     try:
         if not file.exists():
@@ -54,7 +54,7 @@ def existing_file(path: PathLike, what: str) -> Path:
 
 
 def system_error(error: OSError, path: Path) -> CaptureError:
-    """The error of the operating system about an input, as one line."""
+    """Convert an error of the operating system about an input to one line."""
     reason = (error.strerror or str(error)).lower()
     return CaptureError(reason, where=str(path), hint="check the path, its rights and the disk")
 
@@ -62,7 +62,7 @@ def system_error(error: OSError, path: Path) -> CaptureError:
 def check_output(
     path: PathLike, replaces: Callable[[Path], bool], inputs: Iterable[PathLike] = ()
 ) -> Path:
-    """The resolved path of an output, refused before the computation if it must not be written."""
+    """Return the resolved path of an output; refuse one that must not be written."""
     given = as_path(path, "output", OutputError)
     where = str(given)
     try:
@@ -94,7 +94,7 @@ def refuse_inputs(path: Path, inputs: Iterable[PathLike]) -> None:
 
 
 def is_same_file(one: Path, other: Path) -> bool:
-    """Whether two paths name one file, through any links; neither has to exist."""
+    """Return whether two paths name one file, through any links; neither must exist."""
     try:
         return one.samefile(other)
     except OSError:
@@ -102,7 +102,7 @@ def is_same_file(one: Path, other: Path) -> bool:
 
 
 def output_error(error: Exception, path: Path) -> OutputError:
-    """The error of the operating system or a library about an output, as one line."""
+    """Convert an error of the system or a library about an output to one line."""
     reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
     what = f"it could not be written ({reason.lower()})"
     hint = "check the path, its rights and the room on the disk"
@@ -111,7 +111,7 @@ def output_error(error: Exception, path: Path) -> OutputError:
 
 @contextlib.contextmanager
 def atomic_write(path: PathLike, replaces: Callable[[Path], bool]) -> Iterator[Path]:
-    """A temporary path to write to; its file replaces `path` when the block ends without error."""
+    """Yield a temporary path, whose file replaces `path` if the block ends without error."""
     file = check_output(path, replaces)
     with write_errors(file), temporary_folder(file.parent) as folder:
         yield folder / file.name
@@ -119,7 +119,7 @@ def atomic_write(path: PathLike, replaces: Callable[[Path], bool]) -> Iterator[P
 
 
 def replace_file(unfinished: Path, file: Path) -> None:
-    """Replace a file by a finished one: synced, with the mode of the older file."""
+    """Replace a file by a finished one: synced, and with the mode of the older file."""
     if file.exists():
         unfinished.chmod(stat.S_IMODE(file.stat().st_mode))
     sync(unfinished)
@@ -129,7 +129,7 @@ def replace_file(unfinished: Path, file: Path) -> None:
 
 @contextlib.contextmanager
 def write_errors(path: Path) -> Iterator[None]:
-    """Raise errors of the operating system and libraries as `OutputError`."""
+    """Convert errors of the operating system and libraries to `OutputError`."""
     try:
         yield
     except (OSError, RuntimeError, UnicodeError) as error:  # RuntimeError: netCDF, of a full disk
@@ -138,7 +138,7 @@ def write_errors(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def temporary_folder(parent: Path) -> Iterator[Path]:
-    """A temporary folder, removed at the end and by an interrupt."""
+    """Yield a temporary folder, removed at the end and by an interrupt."""
     with tempfile.TemporaryDirectory(dir=parent, prefix=TEMPORARY_PREFIX) as made:
         folder = Path(made)
 
@@ -152,7 +152,7 @@ def temporary_folder(parent: Path) -> Iterator[Path]:
 
 
 def sync(path: Path) -> None:
-    """Write a file, or the names in a folder, to the disk."""
+    """Flush a file, or the entries of a folder, to the disk."""
     if path.is_dir() and os.name != "posix":
         return  # only POSIX systems open folders
     opened = os.open(path, os.O_RDONLY)
@@ -166,12 +166,12 @@ def sync(path: Path) -> None:
 
 
 def compiled_folder() -> Path:
-    """Where programs are kept once they are compiled, unless the user says where."""
+    """Return the default folder of compiled programs."""
     return platformdirs.user_cache_path("polar_bayes") / "compiled"
 
 
 def make_private(folder: Path) -> str:
-    """Why others could write to the folder, which is made if it is not there; empty if not."""
+    """Create a folder; explain why others could write to it, or return an empty text."""
     ours = (folder.parent, folder)
     try:
         folder.parent.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -194,11 +194,11 @@ def make_private(folder: Path) -> str:
 # --- Scene files ----------------------------------------------------------------------------------
 
 SCENE_KEYS = ("setup", "model", "method", "largest_view_zenith", "scene", "links", "priors")
-"""What a scene file may state (`polar_bayes.load_scene`)."""
+"""Keys that a scene file may have (`polar_bayes.load_scene`)."""
 
 
 def is_scene_file(path: Path) -> bool:
-    """Whether a file is TOML with the keys of a scene file."""
+    """Return whether a file is TOML with the keys of a scene file."""
     try:
         return set(tomllib.loads(path.read_text("utf-8"))) <= set(SCENE_KEYS)
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-r"""Default priors, their validation and description.
+r"""Default priors, their validation and their description.
 
 NumPyro samples the log of a positive value. Where the prior density at zero is finite, that log has
 an unbounded left tail, which mixes slowly. `HalfNormal` is sampled in its normal score instead,
@@ -41,12 +41,12 @@ from polar_bayes.repr_html import DisplaySummary, Row, Table
 
 
 def support_bounds(prior: dist.Distribution) -> tuple[float, float]:
-    """Smallest and largest value that a prior allows, infinite where it has no bound."""
+    """Return the smallest and largest value that a prior allows; infinite without a bound."""
     return constraint_bounds(prior.support)
 
 
 def constraint_bounds(support: constraints.Constraint) -> tuple[float, float]:
-    """Smallest and largest value that satisfies a constraint, infinite where it has no bound."""
+    """Return the smallest and largest value that satisfies a constraint, or infinity."""
     while isinstance(support, constraints.independent):
         support = support.base_constraint
     low = getattr(support, "lower_bound", -math.inf)
@@ -58,7 +58,7 @@ def constraint_bounds(support: constraints.Constraint) -> tuple[float, float]:
 
 
 class ByNormalScore(constraints.Constraint):
-    """The values of a transform, whose coordinate is its argument."""
+    """The support of a transform's values, whose unconstrained coordinate is its argument."""
 
     def __init__(self, transform: transforms.Transform) -> None:
         self.transform = transform
@@ -96,11 +96,11 @@ def _by_score(support: ByNormalScore) -> transforms.Transform:
 
 
 BEND = 32.0 / math.pi
-"""Gives `log_odds` the slope at 0 that the log odds of a normal score have."""
+"""Constant of `log_odds` that gives it the slope at 0 of the log odds of a normal score."""
 
 
 def log_odds(z: Float[Array, "..."]) -> Float[Array, "..."]:
-    r"""Log odds of a share by its score, $v = \frac12 z \sqrt{z^2 + 32/\pi}$.
+    r"""Return the log odds of a share from its score, $v = \frac12 z \sqrt{z^2 + 32/\pi}$.
 
     $1/(1+e^{-v})$ is within .0006 of $\Phi(z)$, and its tails fall as those of $\Phi$ do.
     """
@@ -108,12 +108,12 @@ def log_odds(z: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def score_of_log_odds(v: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The score of a share by its log odds."""
+    """Return the score of a share from its log odds."""
     return 2.0 * v / jnp.sqrt(0.5 * (BEND + jnp.sqrt(BEND**2 + (4.0 * v) ** 2)))
 
 
 def log_slope(z: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Log of the derivative of `log_odds`."""
+    """Return the log of the derivative of `log_odds`."""
     return jnp.log(z**2 + 0.5 * BEND) - 0.5 * jnp.log(z**2 + BEND)
 
 
@@ -130,7 +130,7 @@ class HalfNormal(dist.HalfNormal):
 
 
 class NormalScoreToHalfNormal(transforms.Transform):
-    r"""From a normal score to the half-normal value of that score.
+    r"""Transform of a normal score to the half-normal quantile of that score.
 
     A share $2\Phi(-x)$ is beyond a value x of scale 1, and $\Phi(-z)$ beyond a score z: they are
     equal where the log odds v are $e^{v(x)} = 1 + 2 e^{v(z)}$.
@@ -143,7 +143,7 @@ class NormalScoreToHalfNormal(transforms.Transform):
         self.scale = scale
 
     def __call__(self, x: Array) -> Array:
-        """The value of a score."""
+        """Return the half-normal value at a score."""
         odds = log_odds(jnp.asarray(x)) + math.log(2.0)
         return self.scale * score_of_log_odds(jnp.logaddexp(odds, 0.0))
 
@@ -209,12 +209,12 @@ class Beta(dist.Beta):
 
 
 def _is_one(shape: object) -> bool:
-    """Whether a shape is the Python number 1: one that is traced is not known."""
+    """Return whether a shape is the Python number 1; traced values count as others."""
     return isinstance(shape, float | int) and shape == 1.0
 
 
 class NormalScoreToPower(transforms.Transform):
-    r"""From a normal score z to the value of that score whose distribution is a power.
+    r"""Transform of a normal score z to a quantile of a power distribution.
 
     $x = \Phi(z)^{1/p}$ under Beta(p, 1), and $x = 1 - \Phi(-z)^{1/p}$ under Beta(1, p), which
     `falls`; $\Phi$ by its `log_odds`.
@@ -227,7 +227,7 @@ class NormalScoreToPower(transforms.Transform):
         self.power, self.falls = power, falls
 
     def __call__(self, x: Array) -> Array:
-        """The value of a score, inside the numbers between 0 and 1 whose square is one."""
+        """Return the value at a score; squared distances from 0 and 1 are representable."""
         log_share = -jnp.logaddexp(-self._odds(x), 0.0) / self.power
         value = -jnp.expm1(log_share) if self.falls else jnp.exp(log_share)
         number = jnp.finfo(value.dtype)
@@ -266,7 +266,7 @@ class NormalScoreToPower(transforms.Transform):
 
 
 class NormalCoordinate(dist.TransformedDistribution):
-    """Normal in the unconstrained coordinate of a support.
+    """Normal distribution in the unconstrained coordinate of a support.
 
     Args:
         mean: Of the coordinate, in the shape of one draw.
@@ -304,7 +304,7 @@ def prior_text(prior: dist.Distribution, *, is_exact: bool = True) -> str:
 
 
 def parse_prior(text: object, where: str) -> dist.Distribution:
-    """The NumPyro distribution that a text such as `Normal(0, 3)` describes.
+    """Return the NumPyro distribution that a text such as `Normal(0, 3)` describes.
 
     Args:
         text: As `prior_text` writes it, or as it stands in a program. `HalfNormal` and `Beta` are
@@ -321,12 +321,12 @@ def parse_prior(text: object, where: str) -> dist.Distribution:
 
 
 def short_numbers(text: str) -> str:
-    """The text of a prior, its numbers in six digits."""
+    """Round the numbers in the text of a prior to six digits."""
     return re.sub(r"\d+\.\d+(?:e[+-]?\d+)?", lambda found: f"{float(found[0]):g}", text)
 
 
 def unwrapped(distribution: dist.Distribution) -> dist.Distribution:
-    """The distribution inside of masks, copies and events."""
+    """Return the distribution inside masks, expansions and event dimensions."""
     wrappers = dist.distribution.MaskedDistribution | dist.ExpandedDistribution | dist.Independent
     while isinstance(distribution, wrappers):
         distribution = distribution.base_dist
@@ -398,14 +398,14 @@ class _Calls:
 
 
 def _components(prior: Mixture) -> Sequence[dist.Distribution]:
-    """Components of a mixture."""
+    """Return the components of a mixture."""
     is_general = isinstance(prior, dist.MixtureGeneral)
     return prior.component_distributions if is_general else [prior.component_distribution]
 
 
 @functools.cache
 def _distributions() -> Mapping[str, Callable[..., object]]:
-    """What the text of a prior may name: the distributions and transforms of NumPyro."""
+    """Return what the text of a prior may name: NumPyro's distributions and transforms."""
     names = (name for name in dist.__all__ if name[:1].isupper())
     own = {"HalfNormal": HalfNormal, "Beta": Beta}
     known = {name: getattr(dist, name) for name in names} | own
@@ -414,7 +414,7 @@ def _distributions() -> Mapping[str, Callable[..., object]]:
 
 
 def _with_arrays(made: Callable[..., object]) -> Callable[..., object]:
-    """The same for arguments that are tuples of numbers, which NumPyro takes as arrays."""
+    """Wrap the constructors, so that tuples of numbers become arrays for NumPyro."""
 
     def convert(argument: object) -> object:
         if not isinstance(argument, tuple):
@@ -434,14 +434,14 @@ def _with_arrays(made: Callable[..., object]) -> Callable[..., object]:
 
 
 class Priors(dict[str, dist.Distribution]):
-    """A dictionary of priors that a notebook shows with their numbers."""
+    """A dictionary of priors that notebooks show as a table."""
 
     def _repr_html_(self) -> str:
         return prior_card(self)._repr_html_()
 
 
 def prior_card(priors: Mapping[str, dist.Distribution]) -> DisplaySummary:
-    """What each parameter means, its prior and its unit."""
+    """Return a table of parameters: meaning, prior and unit."""
     columns = ("parameter", "meaning", "prior", "unit")
     words = {name: notation(name) for name in priors}
     rows = tuple(
@@ -545,7 +545,7 @@ rotary stage, by hand, or read from a picture through the geometry of its lens. 
 counts as by hand."""
 
 UNCHECKED_GAIN = dist.LogNormal(0.0, 0.3)
-"""Prior of `channel_gain_ratio` where the incident levels of both channels were not read."""
+"""Prior of `channel_gain_ratio` for unknown incident levels of both channels."""
 
 INDICES = (
     *("refractive_index", "cauchy_a", "refractive_index_level"),
@@ -565,14 +565,14 @@ RANGES: dict[str, tuple[float, float]] = {
     "sellmeier_resonance": (0.0, 0.1),
     "beam_overlap_zenith": (0.0, 90.0),
 }
-"""Physical range of a parameter, that of its prior unless stated; others may take any value."""
+"""Physical ranges of parameters with bounded priors; other parameters may take any value."""
 
 
 # --- Resolution and validation --------------------------------------------------------------------
 
 
 class PriorTable(Mapping[str, dist.Distribution]):
-    """The priors that a model may read: the table with a caller's replacements."""
+    """Default priors with the caller's replacements, as models read them."""
 
     # It records the names that are read, so that a model need not list its parameters.
 
@@ -586,7 +586,7 @@ class PriorTable(Mapping[str, dist.Distribution]):
 
     @property
     def read(self) -> tuple[str, ...]:
-        """The names that were read so far, in that order."""
+        """Names that have been read, in order."""
         return tuple(self._read)
 
     @override
@@ -594,7 +594,7 @@ class PriorTable(Mapping[str, dist.Distribution]):
         return cast_prior(self.row(name))
 
     def row(self, name: str) -> dist.Distribution:
-        """The prior as it was given."""
+        """Return the prior as it was given."""
         if name not in self._rows:
             hint = f"give one: priors={{{name!r}: <a NumPyro distribution>}}"
             raise FitError("this parameter has no prior", where=f"priors[{name!r}]", hint=hint)
@@ -613,7 +613,7 @@ class PriorTable(Mapping[str, dist.Distribution]):
 
 
 def cast_prior(prior: dist.Distribution) -> dist.Distribution:
-    """A copy of a prior in the floating type of this fit."""
+    """Return a copy of a prior in the floating type of the fit."""
     # Distributions cache lazy attributes in the precision of their first use; a copy made from the
     # arguments alone does not.
 
@@ -628,7 +628,7 @@ def cast_prior(prior: dist.Distribution) -> dist.Distribution:
 def resolve_priors(
     parameters: Iterable[str], overrides: Mapping[str, dist.Distribution] | None = None
 ) -> dict[str, dist.Distribution]:
-    """The prior of every parameter that a model reads."""
+    """Return the prior of every parameter that a model reads."""
     parameters = tuple(parameters)
     table = PriorTable(overrides)
     for name, prior in (overrides or {}).items():
@@ -637,7 +637,7 @@ def resolve_priors(
 
 
 def check_support(name: str, prior: dist.Distribution, where: str) -> None:
-    """Refuse a distribution that allows values outside the physical range of its parameter."""
+    """Refuse a distribution that allows values outside the physical range of a parameter."""
     least, most = RANGES.get(name, (-math.inf, math.inf))
     try:
         low, high = support_bounds(prior)
@@ -649,7 +649,7 @@ def check_support(name: str, prior: dist.Distribution, where: str) -> None:
 
 
 def _in_range(least: float, most: float) -> str:
-    """A hint which distribution to give instead."""
+    """Suggest a distribution with a support inside the physical range."""
     if (least, most) == (0.0, 1.0):
         return "give a Beta distribution, or a truncated one"
     if least == 0.0 and math.isinf(most):
@@ -673,7 +673,7 @@ def _check_override(name: str, prior: object, parameters: tuple[str, ...]) -> No
 
 
 def _refuse_prior(prior: object, where: str) -> NoReturn:
-    """Refuse what is no distribution, and say what to give in its place."""
+    """Refuse a value that is not a distribution, and suggest one."""
     kind, example = type(prior), "numpyro.distributions.Normal(0.0, 1.0)"
     hint = f"give an object such as {example}"
     if isinstance(prior, int | float):
@@ -686,7 +686,7 @@ def _refuse_prior(prior: object, where: str) -> NoReturn:
 
 
 def _check_shape(name: str, prior: dist.Distribution, where: str) -> None:
-    """Refuse what would be repeated over the wrong axes, or cannot be differentiated."""
+    """Refuse a prior of the wrong shape, or one that cannot be differentiated."""
     if prior.support.is_discrete:
         what = f"{type(prior).__name__} is discrete, and samplers follow gradients"
         raise FitError(what, where=where, hint="give a continuous distribution")

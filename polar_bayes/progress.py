@@ -1,4 +1,4 @@
-"""Progress bars of long runs, shown only where somebody watches: in a terminal or a notebook.
+"""Progress bars of long runs, shown in terminals and notebooks only.
 
 A function that takes minutes has an argument `progress`. If it is omitted, Rich draws bars in a
 notebook and in a terminal, and nothing is written to a file, a pipe or a log. Bars are erased when
@@ -31,26 +31,26 @@ from rich.progress import Progress as Bars
 from polar_bayes.interrupts import on_interrupt
 
 Progress = Callable[[str, float], None]
-"""Called with the name of a stage and the completed fraction of it."""
+"""Function of the name of a stage and the completed fraction of it."""
 
 Counter = Callable[[int, int], None]
-"""Called with the number of completed items and the total number."""
+"""Function of the number of completed items and the total number."""
 
 REFRESH_SECONDS = 0.2
 """Shortest time between two updates of a notebook."""
 
 LINE_SECONDS, MOST_LINE_SECONDS = 10.0, 80.0
-"""Time until the first line of a log; it doubles from line to line, up to the second."""
+"""Time until the first line of a log, which doubles from line to line, and its upper limit."""
 
 _write_line: list[Callable[[str], object]] = []
-"""Where lines of a log go, if anywhere."""
+"""Function that writes lines of a log, if set."""
 
 _bars_are_shown = threading.Lock()
-"""Held while bars are shown, so that nested runs add none."""
+"""Lock that is held while bars are shown, so that nested runs add none."""
 
 
 def write_lines(write: Callable[[str], object]) -> None:
-    """Tell long runs in lines from now on, where nobody watches bars.
+    """Report the progress of long runs as lines of a log where bars cannot be shown.
 
     Args:
         write: Called with each line.
@@ -59,7 +59,7 @@ def write_lines(write: Callable[[str], object]) -> None:
 
 
 def notice(text: str) -> None:
-    """Say a sentence where somebody watches, or in the log."""
+    """Print a sentence in a terminal or notebook, or write it to the log."""
     console = Console(stderr=True)
     if _in_notebook() or console.is_terminal:
         console.print(text, markup=False, highlight=False, soft_wrap=True)  # above the bars
@@ -72,12 +72,12 @@ def no_progress(stage: object, done: object) -> None:
 
 
 def with_progress[**P, R](run: Callable[P, R]) -> Callable[P, R]:
-    """Give a function one bar per stage where its argument `progress` is omitted."""
+    """Decorate a function to show a bar per stage if its argument `progress` is omitted."""
     return _with_default(run, stages)
 
 
 def with_counter[**P, R](what: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Give a function a counting bar where its argument `progress` is omitted."""
+    """Decorate a function to show a counting bar if its argument `progress` is omitted."""
     return lambda run: _with_default(run, lambda: counts(what))
 
 
@@ -97,21 +97,21 @@ def _with_default[**P, R](
 
 @contextmanager
 def stages() -> Iterator[Progress]:
-    """One bar per stage, where somebody watches."""
+    """Show one bar per stage in a terminal or notebook."""
     with _bars(TaskProgressColumn()) as show:
         yield lambda stage, fraction: show(stage, fraction, 1.0)
 
 
 @contextmanager
 def counts(what: str) -> Iterator[Counter]:
-    """One bar that counts, where somebody watches."""
+    """Show one bar that counts in a terminal or notebook."""
     with _bars(MofNCompleteColumn(), TaskProgressColumn(show_speed=True)) as show:
         yield lambda done, total: show(what, done, total)
 
 
 @contextmanager
 def _bars(*columns: ProgressColumn) -> Iterator[Callable[[str, float, float], None]]:
-    """Context that yields a function of stage, completed amount and total."""
+    """Yield a function of stage, completed amount and total that updates bars."""
     notebook, console = _in_notebook(), Console(stderr=True)
     watched = notebook or console.is_terminal
     if not (watched or _write_line) or not _bars_are_shown.acquire(blocking=False):
@@ -145,7 +145,7 @@ def _bars(*columns: ProgressColumn) -> Iterator[Callable[[str, float, float], No
 
 @contextmanager
 def _lines(write: Callable[[str], object]) -> Iterator[Callable[[str, float, float], None]]:
-    """The same in lines: what is going on, from time to time."""
+    """Yield the same function, which writes the current stage to the log from time to time."""
     begin, ended, now = time.monotonic(), threading.Event(), ["compiling"]
 
     def show(stage: str, done: float, total: float) -> None:
@@ -169,13 +169,13 @@ def _lines(write: Callable[[str], object]) -> Iterator[Callable[[str, float, flo
 
 
 def _in_notebook() -> bool:
-    """Whether this process is the kernel of a notebook, which has imported IPython already."""
+    """Return whether this process is the kernel of a notebook: it has loaded IPython."""
     ipython = sys.modules.get("IPython")
     return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
 
 
 class _NotebookBars(Bars):
-    """Bars as HTML in one output cell, which is replaced and finally emptied; without widgets."""
+    """Bars in one output cell as HTML without widgets; the cell is emptied at the end."""
 
     # Rich's own bars in a notebook require ipywidgets and leave a dead widget in the saved file.
 
@@ -184,7 +184,7 @@ class _NotebookBars(Bars):
 
     @override
     def start(self) -> None:
-        """Start no live display."""
+        """Start without a live display."""
 
     @override
     def refresh(self) -> None:

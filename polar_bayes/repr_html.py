@@ -1,4 +1,4 @@
-"""HTML representations of values in a notebook: one style, no script.
+"""HTML representations of values in notebooks, in one style and without scripts.
 
 Colors are the notebook's own, so that they suit light and dark themes. Every text is escaped, since
 names of captures, materials and parameters come from files. `repr` is not changed: a terminal, a
@@ -41,16 +41,16 @@ STYLE = """<style>
 .pb-card.good { border-left: 5px solid #009e73; }
 .pb-card.bad { border-left: 5px solid #d55e00; }
 </style>"""
-"""Repeated in each representation, since a notebook may show any of them alone."""
+"""Style that each representation repeats, since a notebook may show any of them alone."""
 
 
 WARNING = re.compile(r"not determined|.*\((outside|too few|fails)\)")
-"""Cells that a page shows in red."""
+"""Cells that pages show in red."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One row of a table as text: its label, what the label means, and the other cells."""
+    """A row of a table as text: label, meaning of the label, and other cells."""
 
     label: str
     cells: tuple[str, ...]
@@ -60,7 +60,7 @@ class Row:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Table:
-    """Rows of text under columns, which are numbers, or prose where `prose` names them.
+    """Rows of text under columns of numbers, or of prose if named in `prose`.
 
     A page also has a caption, and `data`, the numbers with every digit, as a file.
     """
@@ -73,11 +73,11 @@ class Table:
     data: Any = None  # pandas.DataFrame
 
     def first(self, count: int) -> Self:
-        """The same table with its first rows only."""
+        """Return the table with its first rows only."""
         return dataclasses.replace(self, rows=self.rows[:count])
 
     def __html__(self) -> str:
-        """As HTML; Jinja calls this name."""
+        """Return the table as HTML; Jinja calls this method."""
         styles = [' class="prose"' if column in self.prose else "" for column in self.columns]
         head = "".join(
             f'<th scope="col"{style}>{_escaped(column)}</th>'
@@ -91,7 +91,7 @@ class Table:
         return f"<table{identifier}><thead><tr>{head}</tr></thead>{bodies}</table>"
 
     def _body(self, group: str, rows: Sequence[Row], styles: Sequence[str]) -> str:
-        """The rows of a group; those of the first group, which has no title, count most."""
+        """Return the rows of a group; the first group, which has no title, is the main one."""
         lines = []
         if group:
             head = f'<th scope="rowgroup" colspan="{len(self.columns)}">{_escaped(group)}</th>'
@@ -109,7 +109,7 @@ class Table:
         return f"<tbody{titled}>{''.join(lines)}</tbody>"
 
     def _columns(self) -> rich.table.Table:
-        """Numbers to the right, labels and prose to the left."""
+        """Return columns, with numbers aligned right, labels and prose left."""
         grid = rich.table.Table(box=None, pad_edge=False)
         for at, column in enumerate(self.columns):
             grid.add_column(column, justify="right" if at and column not in self.prose else "left")
@@ -118,7 +118,7 @@ class Table:
         return grid
 
     def to_text(self, stream: TextIO | None = None) -> str:
-        """As aligned columns, which fit the width of the stream if that is a terminal."""
+        """Return aligned columns that fit the width of a terminal."""
         width = None if stream is not None and stream.isatty() else 1000
         console = Console(
             file=stream or io.StringIO(), width=width, markup=False, highlight=False, emoji=False,
@@ -151,7 +151,7 @@ class DisplaySummary:
 
 
 class HTMLRepr:
-    """A frozen dataclass whose fields, nested ones included, a notebook shows as HTML."""
+    """A base class of frozen dataclasses whose fields notebooks show as HTML."""
 
     def _repr_html_(self) -> str:
         title = f"<h4>{_escaped(type(self).__name__)}</h4><p><small>{_summary(self)}</small></p>"
@@ -160,7 +160,7 @@ class HTMLRepr:
         return _card(title + fields + "".join(table.__html__() for table in tables))
 
     def extra_tables(self) -> tuple[Table, ...]:
-        """Tables below the fields."""
+        """Return tables to show below the fields."""
         return ()
 
 
@@ -170,7 +170,7 @@ def _card(inside: str, good: bool | None = None) -> str:
 
 
 def _escaped(text: object) -> str:
-    """Any text as HTML that runs nothing, on one line."""
+    """Escape any text as HTML on one line."""
     return html.escape(one_line(str(text)))
 
 
@@ -179,12 +179,12 @@ def _letters(text: str) -> str:
 
 
 def _summary(value: object) -> str:
-    """The first line of the docstring of a value's class."""
+    """Return the first line of the docstring of a value's class."""
     return _escaped((inspect.getdoc(type(value)) or "").partition("\n")[0])
 
 
 def _fields(value: object, *, with_parameters: bool = True) -> str:
-    """A row for each field of a dataclass, and the parameters that it reads."""
+    """Return a row for each field of a dataclass, and the parameters that it reads."""
     rows = {
         field.name.replace("_", " "): _cell(getattr(value, field.name))
         for field in dataclasses.fields(value)  # type: ignore[arg-type]
@@ -201,7 +201,7 @@ def _fields(value: object, *, with_parameters: bool = True) -> str:
 
 
 def _cell(value: object) -> str:
-    """A value as HTML; members of a tuple or mapping on lines of their own."""
+    """Return a value as HTML, with members of a tuple or mapping on separate lines."""
     if value is None:
         return "<small>none</small>"
     if dataclasses.is_dataclass(value) and not isinstance(value, type):

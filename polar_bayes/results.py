@@ -1,4 +1,4 @@
-"""What every kind of result can do: `summary`, `verdict`, `save` and `load`."""
+"""Results of every kind: `summary`, `verdict`, `save` and `load`."""
 
 import dataclasses
 import os
@@ -32,7 +32,7 @@ from polar_bayes.maps.lazy import count_pixels, criticism_sentences, open_map
 from polar_bayes.paths import as_path, atomic_write, existing_file
 
 MIN_GOOD_SHARE = 0.95
-"""Share of the pixels read that need an answer for a map to pass."""
+"""Share of pixels with readings that must have an answer for a map to pass."""
 
 type Capture = xr.Dataset
 type Fit = xr.DataTree
@@ -42,7 +42,7 @@ type Result = xr.DataTree | xr.Dataset
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """A kind of result: its name, how it is recognized, its table, verdict, check and reports.
+    """A kind of result: name, recognition, table, verdict, check and reports.
 
     The reports are the constant `REPORT` of that file of `polar_bayes.reporting`, which is loaded
     when it is used; a kind without has neither page nor figure.
@@ -57,7 +57,7 @@ class Kind:
 
 
 def _describing(name: str, variable: str, source: str) -> Kind:
-    """A kind that describes and cannot fail, read by two functions of the file that makes it."""
+    """Return a descriptive kind, without verdict, from two functions of its file."""
 
     # That file computes with JAX, and is loaded for a result of this kind only.
     def call(what: str, result: object) -> Any:
@@ -84,7 +84,7 @@ def _accuracy_verdict(study: Result) -> Verdict:
 
 
 def _map_summary(maps: xr.Dataset) -> pd.DataFrame:
-    """Over the good pixels: mean and sd of the posterior means, and the median posterior sd."""
+    """Summarize good pixels: mean and sd of posterior means, and median posterior sd."""
     good = (maps["status"] == Status.GOOD).to_numpy()
     rows = {}
     for scalar in map_scalars(maps):
@@ -146,16 +146,16 @@ KINDS = (
     ),
     Kind("fit", FIT.describes, convergence.summary, convergence.verdict, check_fit, "fit_page"),
 )
-"""The kinds of results in the order in which they are tried."""
+"""Kinds of results in the order of their tests."""
 
 
 def kind_of(result: object) -> Kind:
-    """The kind of a result; what is none is taken as a fit, which refuses it with a hint."""
+    """Return the kind of a result; unknown trees count as fits, which refuse them."""
     return next((kind for kind in KINDS if kind.applies(result)), KINDS[-1])
 
 
 def summary(result: Result) -> pd.DataFrame:
-    """The table of a result of any kind, numbers unrounded; printed, it shows every column.
+    """Return the table of a result of any kind, with all columns and numbers unrounded.
 
     Args:
         result: What `polar_bayes.fit`, `fit_pixels`, `calibrate`, `accuracy`, `identify`,
@@ -180,7 +180,7 @@ def summary(result: Result) -> pd.DataFrame:
 
 
 def verdict(result: Result) -> Verdict:
-    """Whether the numbers of a result of any kind may be used, and what follows from them.
+    """Judge whether the numbers of a result may be used, and what follows from them.
 
     A fit by sampling fails on any R-hat above 1.01, any effective sample size below 400 and any
     divergence; every method fails on a draw that is not finite or that its prior or physics rules
@@ -231,7 +231,7 @@ def save(result: Result, path: str | os.PathLike[str]) -> None:
 
 
 def load(path: str | os.PathLike[str], kind: str | None = None) -> Any:
-    """A result of any kind from the file that `save` wrote, or a map from its Zarr store.
+    """Read a result of any kind from the file of `save`, or a map from its Zarr store.
 
     Args:
         path: A netCDF file, or the folder of a store (its name ends in .zarr).
@@ -258,7 +258,7 @@ def load(path: str | os.PathLike[str], kind: str | None = None) -> Any:
 
 
 def _read(path: str | os.PathLike[str], wanted: str) -> tuple[Result, str]:
-    """A tree, or the dataset of a store or of a file without groups, and the path as text."""
+    """Return a tree, or a dataset without groups, from a path, and the path as text."""
     if as_path(path, wanted).suffix == ".zarr":
         return open_map(path), str(path)
     file = existing_file(path, wanted)

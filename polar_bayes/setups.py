@@ -129,7 +129,7 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
 
 
 def find_setup(name: str | Setup) -> Setup:
-    """The set-up of that name; one of a user's own is returned as it is."""
+    """Return the set-up of a name; a user's set-up is returned unchanged."""
     if isinstance(name, Setup):
         return name
     if not isinstance(name, str) or name not in SETUPS:
@@ -170,7 +170,7 @@ def _at_mirror_angles(setup: Setup) -> Setup:
 
 
 def _by_polarized_light(setup: Setup, angle: float) -> Setup:
-    """The light of an ellipsometer, of which u tells the phase between s and p."""
+    """Add an ellipsometer's polarized light, by which u depends on the phase of s and p."""
     surface = setup.scene.surface
     if not isinstance(surface, SmoothSurface) or "q" not in setup.links:
         return setup
@@ -193,7 +193,7 @@ def _of_one_channel(setup: Setup, capture: xr.Dataset) -> Setup:
 
 
 def setup_name(setup: Setup) -> str:
-    """The name of the set-up that has this scene, or "custom"."""
+    """Return the name of the set-up that has this scene, or "custom"."""
     scene = setup.scene.perfectly_known
     names = [name for name, own in SETUPS.items() if own.scene == scene]
     return next(
@@ -204,7 +204,7 @@ def setup_name(setup: Setup) -> str:
 def default_priors(
     setup: Setup, capture: xr.Dataset, known: Mapping[str, float] | None = None
 ) -> dict[str, dist.Distribution]:
-    """Priors of a set-up, and those that follow from how the capture says that it was made.
+    """Return priors of a set-up, adapted to how the capture was made.
 
     The caller may say what the set-up is known to: standard uncertainties by input quantity.
     """
@@ -226,7 +226,7 @@ def _priors_known_to(
     setup: Setup,
     own: Mapping[str, dist.Distribution],
 ) -> dict[str, dist.Distribution]:
-    """Priors of what a caller, or else an attribute of a capture, says that is known."""
+    """Return priors of input quantities that the caller or the capture states."""
     every = {**PRIORS, **own}
     usual = {name: every[name] for name in setup.scene.parameters if name in every}
     names = {name.removesuffix("_offset"): name for name in usual if _is_error(usual[name])}
@@ -247,13 +247,13 @@ def _priors_known_to(
 
 
 def check_uncertainty(u: object, where: str) -> None:
-    """Raise FitError where a value is no standard uncertainty."""
+    """Raise FitError unless a value is a standard uncertainty."""
     if not isinstance(u, Real) or isinstance(u, bool) or not 0.0 < float(u) < math.inf:
         raise FitError(f"it is {u!r}", where=where, hint="give a number above 0")
 
 
 def _is_error(prior: dist.Distribution) -> bool:
-    """Whether a prior is that of something which is zero in a perfect set-up."""
+    """Return whether a prior is that of an error, which is zero in a perfect set-up."""
     is_centered = isinstance(prior, dist.Normal) and np.ndim(prior.loc) == 0 and prior.loc == 0.0
     return is_centered or isinstance(prior, dist.HalfNormal)
 
@@ -263,7 +263,7 @@ def prior_table(
     *,
     priors: Mapping[str, dist.Distribution] | None = None,
 ) -> pd.DataFrame:
-    """The priors as a table.
+    """Return the priors as a table.
 
     Args:
         scene: A set-up or its name, whose links' noise is listed too, or a scene; by default every

@@ -1,4 +1,4 @@
-"""Simulated captures of known truth: presets of materials, protocols of views, and `simulate`.
+"""Simulated captures with known truth: materials, view protocols, and `simulate`.
 
 The presets are plausible values, not measurements. Refractive indices at 450, 550 and 650 nm follow
 published dispersion (water, BK7 glass and PMMA to 0.002); a leaf absorbs blue and red and leaves
@@ -46,7 +46,7 @@ REFERENCE_WAVELENGTHS = (450.0, 550.0, 650.0)
 
 @dataclasses.dataclass(frozen=True)
 class Material:
-    """The truth about one material.
+    """True parameters of one material.
 
     Args:
         roughness: Microfacet roughness, unit 1.
@@ -61,7 +61,7 @@ class Material:
     refractive_index: tuple[float, float, float]
 
     def at(self, wavelengths: np.ndarray) -> dict[str, np.ndarray]:
-        """The parameters at any wavelengths, interpolated; the ends continue unchanged.
+        """Return parameters at any wavelengths, interpolated, and constant beyond the ends.
 
         Args:
             wavelengths: (wavelength,), unit nm.
@@ -90,7 +90,7 @@ PRESETS: Mapping[str, Material] = MappingProxyType(
 
 
 def find_preset(name: str) -> Material:
-    """The material of that name."""
+    """Return the material of a name."""
     if not isinstance(name, str) or name not in PRESETS:
         hint = f"give one of {', '.join(PRESETS)}"
         raise CaptureError("no such material", where=f"preset={name!r}", hint=hint)
@@ -102,7 +102,7 @@ def find_preset(name: str) -> Material:
 
 @dataclasses.dataclass(frozen=True)
 class Protocol:
-    """Views on rings of azimuth, with the light fixed.
+    """Views on rings of azimuth under a fixed light.
 
     Args:
         views: How many, at least 2.
@@ -137,7 +137,7 @@ class Protocol:
                 raise CaptureError(f"{name} is {getattr(self, name)}", where="Protocol", hint=hint)
 
     def angles(self) -> dict[str, np.ndarray]:
-        """Directions of every view.
+        """Return directions of every view.
 
         Returns:
             view_zenith, view_azimuth, light_zenith and light_azimuth, each (view,), in degree.
@@ -166,7 +166,7 @@ NEUTRAL: Mapping[str, np.ndarray] = {
     **dict.fromkeys((name for name in PRIORS if name.endswith("_offset")), np.asarray(0.0)),
     "discrepancy_weights": np.zeros(3),
 }
-"""A perfect instrument and a level sample, by the names of the terms' parameters."""
+"""Values of a perfect instrument and a level sample, by parameter of the terms."""
 
 Value = float | np.ndarray
 
@@ -174,7 +174,7 @@ Value = float | np.ndarray
 def checked_parameters(
     scene: Scene, material: Material, wavelengths: np.ndarray, overrides: Mapping[str, Value]
 ) -> dict[str, np.ndarray]:
-    """A value for every parameter of the scene."""
+    """Return a value for every parameter of the scene."""
     if unknown := set(overrides) - set(scene.parameters):
         what = f"the scene has no parameter {', '.join(sorted(unknown))}"
         hint = f"give any of {', '.join(scene.parameters)}"
@@ -204,7 +204,7 @@ def checked_parameters(
 def checked_noise(
     links: Mapping[str, AbstractLink], defaults: Mapping[str, float], overrides: Mapping[str, Value]
 ) -> dict[str, np.ndarray | None]:
-    """A value for every noise parameter of the links."""
+    """Return a value for every noise parameter of the links."""
     parameters = noise_parameters(links)
     if unknown := set(overrides) - set(parameters):
         what = f"no link reads {', '.join(sorted(unknown))}"
@@ -228,7 +228,7 @@ def checked_noise(
 def image_shape(
     parameters: Mapping[str, np.ndarray], noise: Mapping[str, np.ndarray | None]
 ) -> tuple[int, ...]:
-    """The shape of the image that parameters and noise define; empty without one."""
+    """Return the shape of the image of parameters and noise; empty without one."""
     named = [(f"parameters[{name!r}]", value) for name, value in parameters.items()]
     named += [(f"noise[{name!r}]", level) for name, level in noise.items() if level is not None]
     images = [(name, value.shape) for name, value in named if value.ndim == 2]
@@ -242,12 +242,12 @@ def image_shape(
 
 
 def is_vector(name: str) -> bool:
-    """True of a parameter that has an axis of its own, for which a capture has no dim."""
+    """Return True for a parameter with an axis that no dim of a capture represents."""
     return np.ndim(NEUTRAL.get(name, 0.0)) > 0
 
 
 def _checked_numbers(name: str, value: Value, where: str, *, open_low: bool = False) -> np.ndarray:
-    """Numbers in the physical range, which may be open below."""
+    """Return numbers inside the physical range, which may be open below."""
     try:
         numbers = np.asarray(value, float)
     except (TypeError, ValueError):
@@ -275,15 +275,15 @@ NOISE: Mapping[str, float] = {
     "stokes_error_factor": 1.0,
     "intensity_scale": 0.01,
 }
-"""Noise of a careful laboratory capture, by the names of the links' parameters."""
+"""Noise of a careful laboratory capture, by parameter of the links."""
 
 IMAGE = ("y", "x")
 
 STATED_ERROR = 0.01
-"""Standard error that the instrument states of every reading, for the links that read it."""
+"""Standard error that the simulated instrument states of every reading."""
 
 BRIGHT_QUANTILE, BRIGHT_LEVEL = 0.9, 0.6
-"""Exposure puts the 90% brightest view at 60% of full scale; a specular lobe may saturate."""
+"""Exposure: the 90% quantile of brightness is at 60% of full scale; specular lobes may saturate."""
 
 
 def simulate(
@@ -382,7 +382,7 @@ _RECORDERS: LRUCache[Callable[..., dict[str, Array]]] = LRUCache(16)
 def _recorder(
     scene: Scene, links: Mapping[str, AbstractLink], image: tuple[int, ...]
 ) -> Callable[..., dict[str, Array]]:
-    """`_record` of a scene and its links, compiled; another one where their code has changed."""
+    """Return the compiled `_record` of a scene and its links; new code is compiled again."""
     scene = dataclasses.replace(scene)  # without its ledger
     key = fingerprint(scene, links, image, code=(scene, links))
     return _RECORDERS.of(key, lambda: compiled(functools.partial(_record, scene, links, image)))
@@ -398,7 +398,7 @@ def _record(
     noise: Mapping[str, Array | None],
     seed: Array,
 ) -> dict[str, Array]:
-    """Readings with the dims of the layout: intensity first, since noise depends on it."""
+    """Return readings in the layout's dims, intensity first, on which noise depends."""
     layout = _layout(angles, wavelengths, links, image)
     key_intensity, key_rest = jax.random.split(jax.random.key(seed))
     axes = len(layout.shape)
@@ -435,12 +435,12 @@ def _record(
 
 
 def _align_image(value: Array, axes: int) -> Array:
-    """An image with trailing axes of length 1, so that it has `axes` axes; others unchanged."""
+    """Add trailing axes of length 1 to an image up to `axes` axes."""
     return value.reshape(value.shape + (1,) * (axes - 2)) if value.ndim == 2 else value
 
 
 def _physical(recorded: Mapping[str, Array]) -> dict[str, Array]:
-    """The polarization as an instrument reports it: its degree is at most one."""
+    """Limit the polarization, as instruments do: its degree is at most one."""
     stokes = {name: recorded[name] for name in ("q", "u") if name in recorded}
     length = jnp.sqrt(sum(value**2 for value in stokes.values()))
     physical = {name: value / jnp.maximum(length, 1.0) for name, value in stokes.items()}
@@ -455,7 +455,7 @@ def _layout(
     links: Mapping[str, AbstractLink],
     image: tuple[int, ...],
 ) -> Observations:
-    """The layout of the capture before anything was recorded."""
+    """Return the layout of the capture without readings."""
     dims: tuple[tuple[str, int], ...] = (("view", len(angles["view_zenith"])),)
     if len(wavelengths):
         dims = (("wavelength", len(wavelengths)), *dims)

@@ -74,7 +74,7 @@ def sideways(driver: webdriver.Chrome) -> tuple[int, int]:
 
 
 def faults(driver: webdriver.Chrome) -> list[str]:
-    """What is wrong with the page that is open; nothing, if it is as it should be."""
+    """List what is wrong with the page that is open; empty if nothing is."""
     found = [f"console: {said}" for said in console(driver)]
     driver.execute_script(HIDDEN)
     found += [f"no picture: {name}" for name in driver.execute_script(IMAGES)]

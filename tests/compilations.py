@@ -22,7 +22,7 @@ def compilations() -> Iterator[list[str]]:
 
 
 def compiled_fast(monkeypatch, *, starts, typical, draws, block):
-    """What a fixture yields from where programs are compiled more often than they run."""
+    """Yield the value of a fixture while programs are compiled fast: they run only a few times."""
     numbers = {
         "inference.initialization.STARTS": starts,
         "inference.hierarchical_reparam.MOST_STARTS": 4,

@@ -36,7 +36,7 @@ def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 @pytest.fixture(scope="module")
 def compiled_in_haste() -> Iterator[None]:
-    """For tests whose programs are compiled more often than they run."""
+    """Compile fast in tests whose programs are compiled more often than they run."""
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)

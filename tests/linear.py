@@ -28,7 +28,7 @@ STANDS_FOR = {"body": "subsurface_fraction", "slope": "refractive_index", "gain"
 
 
 def columns(x):
-    """How the reading follows each parameter; x runs from 0 to 1."""
+    """Return the derivative of the readings by each parameter; x runs from 0 to 1."""
     return {
         "body": np.ones_like(x),
         "slope": x,

@@ -119,7 +119,7 @@ MUTATIONS = (
 
 
 def mutate(capture, random):
-    """One to three mutations; those that xarray itself refuses are no captures."""
+    """Make one to three mutations; those that xarray itself refuses are left out."""
     for _ in range(random.integers(1, 4)):
         mutation = pick(random, MUTATIONS)
         try:

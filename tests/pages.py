@@ -48,7 +48,7 @@ class Page(HTMLParser):
 
     @property
     def lines(self) -> list[str]:
-        """What a reader reads: a line for each paragraph, row, link or picture."""
+        """Text of a page: a line for each paragraph, row, link or picture."""
         lines = " ".join(self.read).split("\n")
         return [line for line in (" ".join(line.split()) for line in lines) if line]
 
@@ -61,7 +61,7 @@ class Page(HTMLParser):
 
 
 def faults_of(page: Page) -> list[str]:
-    """What no page may have: other files, scripts, dead anchors, pictures without words."""
+    """List faults of a page: other files, scripts, dead anchors, pictures without words."""
     ids, boxes = page.values("id"), [x for x in page.values("class") if x.startswith("scroll")]
     led_to = {value[1:] for value in page.values("href") if value.startswith("#")}
     led_to |= set(page.values("aria-labelledby"))

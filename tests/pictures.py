@@ -92,7 +92,7 @@ def coherency(normals, view, light, scene=SCENE, truth=TRUTH):
 
 
 def behind_polarizer(matrix, angle, view):
-    """What passes a polarizer whose axis stands at an angle from the camera's x, in each pixel.
+    """Light behind a polarizer whose axis is at an angle from the camera's x, in each pixel.
 
     The axis follows the ray through the lens: it is carried from z to the view by the rotation
     about the line at right angles to both (Rodrigues).

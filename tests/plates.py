@@ -11,7 +11,7 @@ LINKS = {"q": pb.links.StokesLink(stated_errors=True)}
 
 GONIOMETER = {"scene": "goniometer", "links": pb.setups.SETUPS["goniometer"].links}
 GONIOMETER_VIEWS = np.arange(12.0, 79.0, 3.0)
-"""How and where a plate on a goniometer is read, with all that is unknown of the instrument."""
+"""Views and set-up of a plate on a goniometer, with all unknowns of the instrument."""
 
 
 VIEWS = np.linspace(35.0, 75.0, 6)

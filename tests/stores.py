@@ -185,7 +185,7 @@ def assert_same_bits(found: xr.Dataset | xr.DataTree, expected: xr.Dataset | xr.
 
 
 def main() -> None:
-    """What `Stored.start` runs."""
+    """Run `Stored.start` in a process."""
     name, folder, store, asked = sys.argv[1:]
 
     def progress(done: int, every: int) -> None:

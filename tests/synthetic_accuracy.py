@@ -14,7 +14,7 @@ ROWS = {
     ("nuts", "as given"): ([0.03, 0.05, 0.02], 18.0, 6.0),
     ("nuts long", "as given"): ([0.01, 0.02, 0.01], 60.0, 40.0),
 }
-"""By method and override: errors of the means, and seconds of the first fit and the next."""
+"""Errors of the means, and seconds of the first fit and the next, by method and override."""
 
 
 def make_accuracy(rows=None, *, fresh=True, doubts=""):

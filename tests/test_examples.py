@@ -217,7 +217,7 @@ def test_the_paths_of_a_page_exist(page: Path) -> None:
 
 
 def anchors(page: Path) -> set[str]:
-    """What a heading is called in an address, as hosts of repositories and MyST have it."""
+    """Return the anchors of headings, as hosts of repositories and MyST make them."""
     headings = re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE)
     return {re.sub(r"[^\w\s-]", "", heading.lower()).replace(" ", "-") for heading in headings}
 

@@ -19,7 +19,7 @@ HEAVY = ("jax", "numpyro", "arviz", "matplotlib", "xarray", "netCDF4")
 
 
 def run(code):
-    """What a fresh interpreter prints; its errors fail the test."""
+    """Return the output of a fresh interpreter; its errors fail the test."""
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=600
     )

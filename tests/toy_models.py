@@ -22,7 +22,7 @@ def capture(seed: int = 0) -> xr.Dataset:
 
 
 def request_of(model, precision: str = "double") -> Request:
-    """What is asked of these readings by a model."""
+    """Return the request of a model for these readings."""
     links = {"q": pb.links.StokesLink()}
     return resolve(capture(), model, "paper", None, links, 90.0, 0, precision)
 

@@ -59,7 +59,7 @@ def mirrored(powers, view, light, incident=(0.0, 0.0)):
 
 
 def cosine(index: complex, sin_squared: float) -> complex:
-    """Of the angle in a medium; sin_squared is in air."""
+    """Cosine of the angle in a medium; sin_squared is in air."""
     return np.sqrt(1.0 - sin_squared / complex(index) ** 2)
 
 

@@ -1,4 +1,4 @@
-"""The posterior that every peer samples, and what a peer is."""
+"""The posterior that every peer samples, and the interface of a peer."""
 
 import abc
 import dataclasses
@@ -67,7 +67,7 @@ class Posterior:
 
 
 class Round(NamedTuple):
-    """What a peer has after one more round.
+    """State of a peer after one more round.
 
     Args:
         parameters: All draws that it keeps so far, by name, each (chain, draw).

@@ -43,16 +43,16 @@ PEERS = (
     "polar_bayes", "numpyro", "blackjax", "pymc", "emcee", "bumps", "scipy",
 )  # fmt: skip
 DEVICE_EACH = ("numpyro", "blackjax")
-"""Whose guides ask for a device for each chain, which is set before JAX is imported."""
+"""Peers whose guides ask for a device per chain, which is set before JAX is imported."""
 LARGEST_R_HAT, LEAST_WORTH = 1.01, 400.0
 PATIENCE = 4
 """Limits after which a process is stopped: a round that has begun may take longer than its time."""
 LONG = 20_000
-"""Draws of the reference, per chain."""
+"""Number of draws of the reference, per chain."""
 
 
 def judge(found: Any, reference: dict[str, list[float]]) -> dict[str, Any]:
-    """What the draws of one round are worth, and how far they are off."""
+    """Return diagnostics and errors of the draws of one round."""
     rows = []
     for name, (mean, sd, _) in reference.items():
         drawn = found.parameters[name]

@@ -3,8 +3,8 @@
 #
 # Least squares answer in an instant, long chains in a minute. Which is good enough? That depends on
 # the capture: on how far its posterior is from a normal distribution. So measure it: run the
-# methods on the capture itself, hold each against a long reference whose own error is known, and
-# look at error against time.
+# methods on the capture itself, compare each with a long reference of known error, and plot error
+# against time.
 
 # %%
 # %matplotlib inline
@@ -14,8 +14,8 @@ import xarray as xr
 import polar_bayes as pb
 
 # %% [markdown]
-# Six readings of a polished plate with a weak body: few, so that the posterior is not normal, and
-# quickly fitted.
+# The capture has six readings of a polished plate with a weak body: too few for a normal posterior,
+# and quickly fitted.
 
 # %%
 plate = pb.Scene(pb.SmoothSurface(), pb.Unpolarized(), pb.StokesMixing())
@@ -61,11 +61,11 @@ pb.plots.plot_accuracy(study)
 
 # %% [markdown]
 # `error` is the largest error of any mean or standard deviation, in posterior standard deviations;
-# `worst` says of which parameter. It is the factor on the stated errors each time: six readings
-# tell little of it, and its posterior leans to one side, which a normal distribution cannot. Least
-# squares knows of no noise and is off by more than one and a half. Weights help, chains help more.
-# `resolved` is False where the error is at most twice what the reference itself may be off by: from
-# there on the study cannot tell errors from nothing, and the figure is gray.
+# `worst` names the parameter. It is the factor on the stated errors each time: six readings
+# determine it poorly, and its posterior is skewed, unlike a normal distribution. Least squares has
+# no noise model and is off by more than one and a half. Weights help, chains help more. `resolved`
+# is False where the error is at most twice that of the reference: the study cannot resolve such
+# errors, and the figure is gray there.
 #
 # The seconds are those of a second fit, when all programs are compiled, on the machine that built
 # this page and whatever else it did then.
@@ -76,14 +76,14 @@ pb.plots.plot_accuracy(study)
 print(pb.benchmark.accuracy_sentences(study))
 
 # %% [markdown]
-# That is said of this capture. With more readings a posterior comes closer to a normal
-# distribution, and cheap methods closer to right; [accuracy](../accuracy.md) says how all of this
-# is measured.
+# This advice holds for this capture. With more readings a posterior is closer to a normal
+# distribution, and cheap methods are more accurate; [accuracy](../accuracy.md) explains how all of
+# this is measured.
 #
 # ## Let it choose
 #
-# `method="auto"` needs no reference. It climbs the ladder and takes the first method whose own
-# diagnostics say that it is good enough: here within a quarter of a posterior standard deviation.
+# `method="auto"` needs no reference. It tries methods from cheap to exact and selects the first
+# that passes its own diagnostics: here within a quarter of a posterior standard deviation.
 
 # %%
 result = pb.fit(
@@ -93,10 +93,10 @@ print(*pb.inference.auto_sentences(result), sep="\n")
 pb.summary(result).round(3)
 
 # %% [markdown]
-# It asked importance sampling twice, the second time with more draws, and did not believe it: the
-# weights themselves say that a few draws carry much. The study above knows better, since it has a
-# reference; a choice without one has to be careful. Chains satisfied it. Most of the
-# seconds are compilation, which a second fit of this layout does not pay.
+# It ran importance sampling twice, the second time with more draws, and rejected it, because a few
+# draws have most of the weight. The study above shows that these draws are accurate, since it has a
+# reference; a choice without one has to be careful. Chains passed. Most of the seconds are
+# compilation, which a second fit of this layout does not pay.
 #
-# What no diagnostic here sees is a wrong scene: every method is measured against the posterior, not
+# No diagnostic here detects a wrong scene: every method is measured against the posterior, not
 # against the truth. [Measured data](measured_plates.py) shows the difference.

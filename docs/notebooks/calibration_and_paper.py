@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Calibration, and the paper's tables
 #
-# A 95% interval should hold the truth 19 times in 20. That cannot be seen in one fit, and not in
-# real data, whose truth is unknown. It can be counted: draw parameters from the prior, simulate
+# A 95% interval should contain the truth 19 times in 20. One fit cannot show that, and neither can
+# real data, whose truth is unknown. But it can be counted: draw parameters from the prior, simulate
 # captures, fit each, and look where the truth lies among the draws. Where model, prior and method
 # are right, its rank is uniform.
 
@@ -20,10 +20,10 @@ import polar_bayes as pb
 # %% [markdown]
 # ## A small calibration
 #
-# Of the capture only the layout counts: which views, which readings, which errors. Here a polished
-# plate at 12 angles, and 200 simulations. (The
-# [numbers to quote](../calibration.md#what-it-costs-and-what-it-showed) come from a thousand and
-# more, of the paper's scene.)
+# Only the layout of the capture matters: its views, recorded variables and errors. Here a polished
+# plate at 12 angles, and 200 simulations. (The [numbers to
+# quote](../calibration.md#cost-and-coverage-measured) come from a thousand and more, of the paper's
+# scene.)
 
 # %%
 plate = pb.Scene(pb.SmoothSurface(), pb.Unpolarized(), pb.StokesMixing())
@@ -53,19 +53,19 @@ pb.plots.plot_calibration(calibration)
 
 # %% [markdown]
 # `held_95` is the share of the simulations whose 95% interval holds the truth, between
-# `held_95_low` and `held_95_high` as far as 200 simulations tell. The verdict judges whole ranks of
-# all parameters together; a right method fails it once in twenty times. It passed: 200 simulations
-# found nothing. They would see gross mistakes, not small ones.
+# `held_95_low` and `held_95_high` given 200 simulations. The verdict tests the ranks of all
+# parameters together; a correct method fails it once in twenty times. This one passed. Two hundred
+# simulations detect gross mistakes, but not small ones.
 #
 # Do not read "calibrated" as "precise". A posterior that ignores the data and returns the prior is
-# calibrated, too. Widths (`width_95`) and scores (`crps`, less is better) are beside it for that
+# calibrated, too. Widths (`width_95`) and scores (`crps`, less is better) are in the table for that
 # reason.
 #
-# ## Would it notice?
+# ## Would it detect a wrong prior?
 #
-# A test that never fails is worth nothing. `truth` says by what other story the captures are
-# simulated. Here the plates have indices spread evenly from 1.2 to 2.0, while the fit goes on
-# believing in 1.45 give or take 0.15:
+# A test that never fails is useless. `truth` names another model by which the captures are
+# simulated. Here the indices of the plates are uniform from 1.2 to 2.0, while the prior of the fit
+# is 1.45 with an sd of 0.15:
 
 # %%
 elsewhere = {"priors": {"refractive_index": dist.Uniform(1.2, 2.0)}}
@@ -74,10 +74,11 @@ print(*pb.verdict(broken).sentences, sep="\n")
 pb.summary(broken).transpose()
 
 # %% [markdown]
-# It noticed: the 95% intervals of the index hold about 82% of such truths, and the ranks say in
-# which direction the fit is off. Two things did not notice. The noise (`stokes_error_factor`) is
-# still well calibrated, because that part of the model was right. And the readings pass their
-# own test: a fit that puts the index in the wrong place can still predict what will be read.
+# The test detects it: the 95% intervals of the index contain about 82% of such truths, and the
+# ranks show the direction of the error. Two results are not affected. The noise
+# (`stokes_error_factor`) is still well calibrated, because that part of the model was right. And
+# the readings pass their own test: a fit that puts the index in the wrong place can still predict
+# what will be read.
 #
 # ## One line of the paper's tables
 #
@@ -111,4 +112,4 @@ print(f"{100 * change.mean():+.0f}% +- {100 * change.sem():.0f}%")
 # direction is the paper's, the size is not, and here as there nothing was tuned until it agreed.
 #
 # The error given is the scatter between five simulated glasses: it is that of this scene and this
-# approximation, and says nothing about other scenes.
+# approximation, and does not apply to other scenes.

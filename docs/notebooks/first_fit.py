@@ -48,10 +48,11 @@ verdict = pb.verdict(result)
 pb.summary(result).round(3)
 
 # %% [markdown]
-# A row for each parameter: mean and standard deviation of the posterior, its 95% interval, and what
-# the sampler says of itself. `r_hat` near 1 means that all chains found the same distribution; the
-# effective sample sizes count what the draws are worth. The last three rows are the noise and the
-# exposure, which nobody knew and which are inferred with the rest.
+# A row for each parameter: mean and standard deviation of the posterior, its 95% interval, and
+# diagnostics of the sampler. `r_hat` near 1 means that all chains found the same distribution; the
+# effective sample sizes are the numbers of independent draws with the same Monte Carlo error. The
+# last three rows are the noise and the exposure, which nobody knew and which are inferred with the
+# rest.
 #
 # Before any number is quoted:
 
@@ -61,8 +62,8 @@ print("problems:", verdict.problems)
 print("cautions:", verdict.cautions)
 
 # %% [markdown]
-# No problem and no caution is only half of the check. "Converged" says that the sampler did its
-# work, not that the readings told anything. That is the next question: how much narrower is each
+# No problem and no caution is only half of the check. "Converged" means that the sampler worked,
+# not that the readings were informative. That is the next question: how much narrower is each
 # interval than it was before the data?
 
 # %%
@@ -70,9 +71,8 @@ sensitivity(result)[["width_left", "verdict"]].round(2)
 
 # %% [markdown]
 # `width_left` is the width of the 95% interval over that of the prior. Roughness and subsurface
-# fraction are determined well. Of the absorption the prior is mostly left: its interval says
-# what was
-# believed before as much as what was measured, and should not be quoted as a measurement.
+# fraction are determined well. The interval of the absorption is mostly that of the prior, and
+# should not be quoted as a measurement.
 #
 # ## The picture, and the truth
 #
@@ -112,7 +112,7 @@ result["posterior"].to_dataset().to_dataframe()[[*names, "exposure"]].corr().rou
 # %% [markdown]
 # Absorption and exposure go together most: a body that absorbs more, under a longer exposure, looks
 # nearly the same. The index goes along, against both. So whoever measures the exposure, or
-# photographs a white reference beside the sample, learns the absorption and the index better
+# photographs a white reference next to the sample, learns the absorption and the index better
 # without touching either.
 #
 # ## The report
@@ -125,7 +125,7 @@ page = pb.report(result, "report")
 print(page.name, f"{page.stat().st_size / 1e6:.1f} MB")
 
 # %% [markdown]
-# ## What this did not say
+# ## Limits of this example
 #
 # The readings were drawn from the very scene and noise that were fitted. A wrong scene can fit
 # well, and give a narrow and wrong answer without any warning: [measured

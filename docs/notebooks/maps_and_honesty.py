@@ -2,9 +2,9 @@
 # # Maps, and which pixels to trust
 #
 # A camera gives every pixel its own readings, so every pixel can have its own posterior. A map of
-# means looks well whatever it is worth. So a map here carries, for each pixel, how wide its
-# posterior is, by which way it was found, and whether it can be trusted; and on a simulated image
-# one can count how often the intervals hold the truth.
+# means looks convincing whether or not it is accurate. So a map here has, for each pixel, the width
+# of its posterior, the method that found it, and a status. On a simulated image one can count how
+# often the intervals contain the truth.
 
 # %%
 # %matplotlib inline
@@ -46,8 +46,8 @@ image = pb.simulate(
 print(pb.capture.count(image))
 
 # %% [markdown]
-# A camera whose channels stopped knows no polarization there. Readings at full scale are marked as
-# not valid: they stay in the capture, are counted, and contribute nothing.
+# A camera whose channels are saturated cannot measure polarization there. Readings at full scale
+# are marked as not valid: they stay in the capture, are counted, and contribute nothing.
 
 # %%
 image = image.assign(valid=~image["saturated"])
@@ -55,8 +55,8 @@ image = image.assign(valid=~image["saturated"])
 # %% [markdown]
 # ## The map
 #
-# Polarization alone is fitted, with its noise known; brightness only tells how strong the noise of
-# a reading is.
+# Polarization alone is fitted, with its noise known; brightness only determines the noise of a
+# reading.
 
 # %%
 model = numpyro.handlers.condition(per_material, data={"stokes_scale": 0.01})
@@ -68,13 +68,13 @@ print(pb.maps.count_pixels(maps))
 pb.plots.plot_maps(maps)
 
 # %% [markdown]
-# 723 pixels are good; the 45 of the highlight are masked, say so, and have no number. The index
-# (whose sd is drawn below its mean) is known well where the plate is bright, and hardly in the
-# shadow. An image of means alone would not show that.
+# 723 pixels are good; the 45 of the highlight are masked, and have a status but no number. The
+# index (whose sd is drawn below its mean) is known well where the plate is bright, and hardly in
+# the shadow. An image of means alone would not show that.
 #
 # ## Do the intervals hold?
 #
-# Beside the corrected map, one that takes the normal approximation at its word:
+# For comparison, here is a map by the uncorrected normal approximation:
 
 # %%
 bare = pb.fit_pixels(image, method="laplace", **fitted)
@@ -85,15 +85,15 @@ pd.concat(
 ).round(3)
 
 # %% [markdown]
-# Both hold the truth about as often as they say; the correction changes little, because with twelve
+# Both have nearly their nominal coverage; the correction changes little, because with twelve
 # readings and two unknowns these posteriors are nearly normal. Where they are not, it matters: [the
-# numbers](../maps.md#report).
+# numbers](../maps.md#report-and-coverage-of-a-map).
 #
 # Strictly, coverage is promised on average over truths that are drawn from the prior. These truths
-# were painted, so a share a little above or below says nothing against the map; a share far off
-# would.
+# were painted, so a share slightly above or below does not contradict the map; a very different
+# share would.
 #
-# ## Where it is sure, and where not
+# ## Precise and imprecise pixels
 
 # %%
 regions = {"shadow": shadow, "highlight": highlight, "elsewhere": ~shadow & ~highlight}
@@ -107,13 +107,13 @@ for name, region in regions.items():
     )
 
 # %% [markdown]
-# In the shadow the noise is stronger, and the map says so: its sd is more than twice as large.
-# Errors there are even smaller than announced (a ratio below 1), since the prior pulls doubtful
-# pixels to the middle, where these truths happen to be. Elsewhere errors are as large as announced.
+# In the shadow the noise is stronger, and the sd of the map is more than twice as large. Errors
+# there are even smaller than the sd (a ratio below 1), since the prior shrinks uncertain pixels
+# towards its center, where these truths happen to be. Elsewhere errors are as large as the sd.
 #
 # ## What goes wrong if the stated noise is wrong
 #
-# A map believes the noise that it is given. Told that readings are twice as good as they are:
+# A map uses the noise that it is given. Here the stated noise is half the true noise:
 
 # %%
 bold = numpyro.handlers.condition(per_material, data={"stokes_scale": 0.005})
@@ -122,14 +122,14 @@ print(pb.maps.count_pixels(overconfident))
 pb.diagnostics.map_coverage(overconfident, image)[held].round(3)
 
 # %% [markdown]
-# The 95% intervals now hold two thirds of the truths, and every pixel still calls itself good: its
-# draws describe its posterior well, and it is the posterior that is wrong. No diagnostic of a
-# single pixel sees that. The readings of all of them would: fit the noise on a patch first, or
-# leave it unknown (slower, and wider).
+# The 95% intervals now contain two thirds of the truths, and the status of every pixel is still
+# good: its draws describe its posterior well, and it is the posterior that is wrong. No diagnostic
+# of a single pixel detects that, but the readings of all pixels would: fit the noise on a patch
+# first, or leave it unknown (slower, and wider).
 #
 # ## The mean of a region
 #
-# Pixels are independent given what they share, and here they share nothing:
+# Pixels are independent given their shared parameters, and here there are none:
 
 # %%
 means = pb.maps.region_means(maps, shadow)
@@ -140,7 +140,7 @@ means.attrs["cautions"]
 
 # %% [markdown]
 # The interval is that of the map's own model, in which each pixel has a prior of its own. Where the
-# pixels of a region are alike, all those priors pull the same way. In the dark pixels of the shadow
-# they say more of the index than the readings do, and the caution says so: fit such a region as one
-# capture, or as [patches of one population](pooling_and_spectra.py). How maps are made, and how
-# fast: [maps](../maps.md).
+# pixels of a region are alike, all those priors bias the mean in the same direction. In the dark
+# pixels of the shadow the priors are more informative on the index than the readings, which the
+# caution reports: fit such a region as one capture, or as [patches of one
+# population](pooling_and_spectra.py). How maps are made, and how fast: [maps](../maps.md).

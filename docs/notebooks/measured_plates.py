@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Measured data, from the raw file to a conclusion
 #
-# Simulated captures obey the model that fits them. Measured ones do not. Two of them here: a glass
-# plate, whose readings a simple model fits well and wrongly; and white PTFE, where the paper's
-# mixture fits better than the physics does, and gives the wrong index.
+# Simulated captures obey the model that fits them. Measured ones do not. This notebook has two
+# examples: a glass plate, whose readings a simple model fits well and wrongly; and white PTFE,
+# where the paper's mixture fits better than the physics does, and gives the wrong index.
 #
 # The measurements belong to others and are not part of this project. To run this notebook, set
 # `POLAR_BAYES_DATA` to a folder with `glass_fresnel/s1.txt`, `glass_fresnel/p1.txt` (a laser
@@ -30,8 +30,8 @@ folder = Path(os.environ["POLAR_BAYES_DATA"])
 # ## Glass: from two tables to a capture
 #
 # Each file has the angle of incidence in degrees and the detector's reading. The incident beam read
-# 1910 in s and 1630 in p. The index of this glass is known from elsewhere: 1.509. The fit is not
-# told.
+# 1910 in s and 1630 in p. The index of this glass is known from elsewhere: 1.509. The fit does not
+# use it.
 
 # %% mystnb={"image": {"alt": "Signed polarization of glass against the angle"}}
 print((folder / "glass_fresnel" / "s1.txt").read_text()[:40])
@@ -67,7 +67,7 @@ print(pb.verdict(result).problems, pb.verdict(result).cautions)
 pb.summary(result)[["mean", "q2.5", "q97.5", "r_hat", "ess_bulk"]].round(3)
 
 # %% [markdown]
-# Every such fit is made twice more, without the discrepancy and without any instrument term:
+# Every such fit is repeated twice, without the discrepancy and without any instrument term:
 
 # %%
 columns = ["q2.5", "q97.5", "q2.5_without", "q97.5_without"]
@@ -76,10 +76,10 @@ for part in ("discrepancy", "instrument"):
     print(compare_without(result, part)[columns].loc[["refractive_index"]].round(3))
 
 # %% [markdown]
-# With everything on, the interval of the index holds 1.509. It is wide: what the instrument may
-# have done wrong is in it. Without any instrument term it is nine times narrower and does not hold
-# it. That fit, too, runs without a complaint: nothing in 39 smooth readings says that the channels
-# are off by some percent, since index and body can bend to follow.
+# With all terms, the interval of the index contains 1.509. It is wide, because it includes possible
+# errors of the instrument. Without any instrument term it is nine times narrower and does not
+# contain the index. That fit, too, has no problem in its verdict: 39 smooth readings do not show
+# that the channels are off by some percent, since index and body can imitate it.
 #
 # ## PTFE: the better fit is the wrong one
 #
@@ -148,11 +148,11 @@ plt.show()
 
 # %% [markdown]
 # One fraction for all views fits better by every measure here: residuals are a third smaller, and
-# the readings are better predicted. And it moves the index the wrong way. Before the data almost a
-# third of the belief lay at 1.38 or below, where the index of PTFE is; after them, next to nothing.
-# The sum of light fits worse, above all at the steep end, where it expects more polarization than
-# there is: this surface is not made of GGX facets on one smooth boundary. It leaves more room for
-# the right index, but no knowledge of it. Of the two, the better fit is the one that is surely
+# the readings are better predicted. And it moves the index the wrong way. Almost a third of the
+# prior is at 1.38 or below, where the index of PTFE is, but almost none of the posterior. The sum
+# of light fits worse, above all at the steep end, where it expects more polarization than there is:
+# this surface is not made of GGX facets on one smooth boundary. Its interval is wide enough for the
+# right index, but does not determine it. Of the two, the better fit is the one that is surely
 # wrong.
 #
 # The same file says why one fraction for all views cannot be right. Its brightness was not fitted:
@@ -168,12 +168,13 @@ plt.show()
 # On the side of the light the brightness is flat, as that of a matt body is. On the mirror side it
 # rises by two thirds: that rise is light of the surface. So the surface has a third or more of the
 # light at 64 degrees and hardly any at -40, while the fitted fraction gives it the same few percent
-# everywhere. A fit of polarization alone cannot object.
+# everywhere. A fit of polarization alone cannot detect this.
 #
 # ## What to conclude
 #
 # * Glass: quote the wide interval, with what it assumes
-#   ([goniometer](../goniometer.md#what-the-fit-assumes)).
-# * PTFE: quote no index. The data say little of it with either scene, and the scene that fits best
-#   is contradicted by the brightness. Measure the specular lobe, or add its brightness to the fit.
+#   ([goniometer](../goniometer.md#assumptions-of-the-fit)).
+# * PTFE: quote no index. The data hardly determine it with either scene, and the scene that fits
+# best is contradicted by the brightness. Measure the specular lobe, or add its brightness to the
+# fit.
 # * Fit quality does not choose between scenes. What is known of the sample does.

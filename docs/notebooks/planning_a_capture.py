@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Planning a capture
 #
-# Time at the instrument is short. Before it is spent: can the views that are planned tell what is
-# asked at all, and if views may be added, where? Both questions have answers before anything is
+# Time at the instrument is short. Two questions come first: can the planned views determine the
+# parameters of interest, and where should views be added? Both can be answered before anything is
 # measured, since the information of a reading follows from the optics and the noise.
 
 # %%
@@ -21,7 +21,7 @@ capture = pb.simulate("leaf", scene=scene, protocol=protocol, seed=0)
 # Eight views of a leaf, no steeper than 60 degrees: a short first capture. (The scene lets light
 # out of the body through a plane, which compiles sooner than the paper's facets.)
 #
-# ## What can it tell?
+# ## What can the capture determine?
 
 # %%
 found = pb.identify(capture, scene=scene)
@@ -31,17 +31,18 @@ pb.summary(found).round(3)
 print(*pb.verdict(found).sentences, sep="\n")
 
 # %% [markdown]
-# `expected_sd` is what the posterior will be like, `prior_share` how much of its variance is still
-# the prior's. Roughness and subsurface fraction will be known well, the absorption hardly at all:
-# readings see it (its `sensitivity` is large), and see the same in the exposure. The index is in
-# between, and leans on the exposure too. `paper_sd` is what the paper's information promises, which
-# counts polarization alone, with a smaller information than its noise carries; see [what a capture
-# can tell](../identifiability.md#the-papers-information-and-the-exact-one).
+# `expected_sd` is the expected sd of the posterior, `prior_share` the share of its variance that
+# comes from the prior. Roughness and subsurface fraction will be known well, the absorption hardly
+# at all: readings depend on it (its `sensitivity` is large), but in the same way as on the
+# exposure. The index is in between, and is correlated with the exposure, too. `paper_sd` is the sd
+# by the paper's information, which counts polarization alone, with a smaller information than its
+# noise carries; see [what a capture can
+# tell](../identifiability.md#the-papers-information-and-the-exact-one).
 #
-# ## Where the data stop objecting
+# ## Profile likelihood: which values do the data exclude?
 #
-# The table is a linearization at one point. A profile moves one parameter, fits all others anew at
-# every value, and asks whether the readings object.
+# The table is a linearization at one point. A profile moves one parameter, fits all others again at
+# every value, and shows whether the readings exclude it.
 
 # %% mystnb={"image": {"alt": "Log profile likelihood of the refractive index"}}
 curve = pb.profile(capture, "refractive_index", scene=scene)
@@ -61,9 +62,9 @@ others.transpose("value", ...).to_pandas().round(3)
 # Nothing between 1.2 and 1.84 is excluded by the readings alone, although the table expects an sd
 # of 0.05. Both are right. Where the index is moved, absorption and exposure make up for it: at the
 # lower end a body that absorbs ten times as much, at the upper end one that does not absorb at all.
-# The table believes the prior, under which such bodies are rare. So the interval that a fit of
-# these eight views will give for the index is as good as what is believed of the absorption, and a
-# measured exposure or absorption would be worth more than it seems.
+# The table includes the prior, under which such bodies are rare. So the interval of the index in a
+# fit of these eight views depends on the prior of the absorption, and a measured exposure or
+# absorption would be more valuable than it seems.
 #
 # ## Where to look next
 #
@@ -87,12 +88,12 @@ pb.summary(views)
 # Two steep views on the mirror side, as the paper would take them, and one at 25 degrees. The index
 # gains a fifth, the roughness nothing: it was known before.
 #
-# ## Is it worth it?
+# ## How much do chosen views help?
 #
-# The promise rests on a linearization and on the model. [Does it
-# help](../identifiability.md#does-it-help) checks it on 200 simulated materials of the paper's
-# scene: views chosen for the index leave 72% of its posterior sd, evenly spaced ones 86%, random
-# ones 91%, and what was promised is kept within 4%.
+# The prediction depends on a linearization and on the model. [A
+# benchmark](../identifiability.md#how-much-do-chosen-views-help) checks it on 200 simulated
+# materials of the paper's scene: views chosen for the index leave 72% of its posterior sd, evenly
+# spaced ones 86%, random ones 91%, and the predicted sds are correct within 4%.
 #
-# What no such choice knows is whether the scene is right. Views that would tell a wrong scene from
-# a right one are not those that narrow its parameters; keep some of the protocol for them.
+# No such choice accounts for a wrong scene. Views that distinguish a wrong scene from a right one
+# are not those that narrow its parameters; reserve some views for them.

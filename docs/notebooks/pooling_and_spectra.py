@@ -1,10 +1,10 @@
 # %% [markdown]
 # # Many materials, many colors
 #
-# Leaves of one tree, plates of one batch, one plastic in three colors: relatives. What the readings
-# of one cannot tell, the others can, if the model says how they are related. This notebook pools
-# plates of one batch, then couples the colors of one plate, and looks at what is gained and at what
-# price.
+# Leaves of one tree, plates of one batch, one plastic in three colors: all of these are related.
+# Where the readings of one are uninformative, those of the others help, if the model describes the
+# relation. This notebook pools plates of one batch, then couples the colors of one plate, and looks
+# at what is gained and at what price.
 
 # %%
 import matplotlib.pyplot as plt
@@ -76,14 +76,14 @@ plt.show()
 pd.DataFrame(rows).T.round(3)
 
 # %% [markdown]
-# Pooled intervals are a quarter narrower, and here they are nearer to the truth as well; both hold
-# it every time. The plates are drawn towards each other because all of them are known poorly, and
-# only as far as the readings allow: the population is inferred, too. Its spread is not known well
-# (`spread_q2.5` to `spread_q97.5`); eight members say little about it, and its prior matters. Where
-# members differ by far more than their errors, pooling changes next to nothing.
+# Pooled intervals are a quarter narrower, and here they are nearer to the truth as well; both
+# contain it every time. The plates are drawn towards each other because all of them are known
+# poorly, and only as far as the readings allow: the population is inferred, too. Its spread is not
+# known well (`spread_q2.5` to `spread_q97.5`); eight members hardly determine it, and its prior
+# matters. Where members differ by far more than their errors, pooling changes next to nothing.
 #
-# The cautions are to be taken at their word: six readings for two unknowns are no normal posterior,
-# and NUTS (`method="nuts"`, a minute or two) is the method to quote. The comparison with twenty
+# Take the cautions seriously: the posterior of two unknowns from six readings is not normal, and
+# NUTS (`method="nuts"`, a minute or two) is the method to quote. The comparison with twenty
 # replicates is in [pooling](../hierarchical.md#how-it-is-sampled).
 #
 # ## Colors of one plate
@@ -129,10 +129,10 @@ pd.DataFrame({"coupled": pd.Series(width.to_numpy(), index=colors), "alone": alo
 # %% [markdown]
 # In the middle, at 550 nm, the coupled interval is a third narrower, since that color has neighbors
 # on both sides; at the ends of the measured range it is hardly so. At 600 nm, where nothing was
-# measured, the band is as sure as at a measured color alone, and more. At 800 nm it is more than
-# twice as wide: the process does not know that the index goes on falling. A law of dispersion does,
-# and believes itself exactly ([laws](../spectral.md#laws)).
+# measured, the band is at least as narrow as at a measured color alone. At 800 nm it is more than
+# twice as wide: the process does not assume that the index continues to fall. A law of dispersion
+# does, and takes itself to be exact ([laws](../spectral.md#laws)).
 #
 # One truth in this picture proves nothing about bands; five real materials are in
 # [spectra](../spectral.md#five-real-materials). With errors of the optics that depend on color, all
-# of this moves together, and no neighbor objects.
+# of this moves together, and no check detects it.

@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Swapping priors and links
 #
-# A posterior answers for three assumptions: the optics, what was believed before (the prior), and
-# how readings scatter (the link). Whoever doubts an answer should be able to replace one of them
-# and look how it changes. This takes a line each. Here the optics stay as they are; prior and
+# A posterior depends on three assumptions: the optics, the prior, and the distribution of readings
+# around their prediction (the link). Anyone who doubts a result should be able to replace one of
+# them and see how it changes. This takes a line each. Here the optics stay as they are; prior and
 # link change.
 
 # %%
@@ -49,9 +49,9 @@ capture = xr.Dataset(
 # %% [markdown]
 # ## The link
 #
-# With normal noise a reading twenty errors away is next to impossible, so everything else has to
-# give: index, body, or the factor on the stated errors, which is fitted. Student's t with four
-# degrees of freedom expects a wild reading now and then.
+# With normal noise a reading twenty errors away is next to impossible, so the other parameters have
+# to change: index, body, or the fitted factor on the stated errors. Student's t with four degrees
+# of freedom allows for occasional outliers.
 
 # %%
 links = {
@@ -78,13 +78,13 @@ plt.legend()
 plt.show()
 
 # %% [markdown]
-# The normal link gave way in the noise above all: it takes the stated errors for six times too
-# small, and so its interval of the index is three to four times as wide as that of Student's t. It
-# did not move far; bad readings on both sides of Brewster's angle pull it both ways. With other bad
-# readings it could have.
+# With the normal link mainly the noise changed: the errors are six times the stated ones, and so
+# the interval of the index is three to four times as wide as with Student's t. Its mean did not
+# move far, since bad readings on both sides of Brewster's angle pull in both directions. With other
+# bad readings it could have.
 #
-# Which link describes these readings better? The expected log predictive density asks how well each
-# reading is predicted by all others; more is better.
+# Which link describes these readings better? The expected log predictive density measures how well
+# each reading is predicted by all others; higher is better.
 
 # %%
 checks = {name: predictive_checks(fit)["q"].loo for name, fit in fits.items()}
@@ -97,13 +97,13 @@ pd.DataFrame(
 
 # %% [markdown]
 # Student's t is ahead, by less than the standard error of a sum over fourteen readings. And the
-# Pareto k of a bad reading is above 0.7: how it would be predicted without itself is a guess. Where
-# two points decide, the picture says more than the table.
+# Pareto k of a bad reading is above 0.7: its leave-one-out prediction is unreliable. Where two
+# points decide, the figure is more informative than the table.
 #
 # ## The prior
 #
-# A data sheet says 1.50 within 0.005. Any continuous NumPyro distribution will do; what is not
-# named keeps its default. And what if the sheet was of another material, and says 1.60?
+# A data sheet says 1.50 within 0.005. Any continuous NumPyro distribution will do; other parameters
+# keep their default priors. What happens if the sheet is of another material, and states 1.60?
 
 # %%
 robust = {"scene": plate, "links": {"q": links["Student's t"]}, "method": "laplace"}
@@ -116,8 +116,8 @@ answers = {name: pb.fit(capture, priors=prior, **robust) for name, prior in beli
 pd.concat({name: pb.summary(answer)[columns] for name, answer in answers.items()}).round(3)
 
 # %% [markdown]
-# The right sheet narrows the interval of the index to a third, the wrong one moves it to 1.60, as
-# surely as if the readings had said so. The fit does not object. Where does the answer come from?
+# The right sheet narrows the interval of the index to a third, the wrong one moves it to 1.60, with
+# as narrow an interval. No check of the fit fails. Where does the result come from?
 
 # %%
 sensed = ["width_left", "prior_sensitivity", "likelihood_sensitivity", "verdict", "remark"]
@@ -125,13 +125,12 @@ pd.concat({name: sensitivity(answer)[sensed] for name, answer in answers.items()
 
 # %% [markdown]
 # With either sheet the index has the width that the sheet gave it (`width_left` near 1: "not
-# determined") and leans on the prior. That is what one wants of a sheet that one believes; the
-# table cannot know whether the sheet is right. The readings can: to make room for the wrong one the
-# fit had to take them for nearly three times noisier than with the right one
-# (`stokes_error_factor`). An estimated noise well above the stated one is the first thing to look
-# at after a prior was narrowed.
+# determined") and depends on the prior. That is intended for a reliable sheet; the table cannot
+# show whether the sheet is right. The readings can: with the wrong sheet the fitted noise is nearly
+# three times that with the right one (`stokes_error_factor`). An estimated noise well above the
+# stated one is the first thing to look at after a prior was narrowed.
 #
-# ## Knowing exactly
+# ## Fixing a parameter
 #
 # A value that is not in doubt is held by a handler of NumPyro rather than by a narrow prior. It is
 # then not a parameter of the posterior any more.
@@ -149,9 +148,9 @@ said = provenance_of(held)
 print(said["fixed"], said["links"])
 
 # %% [markdown]
-# ## What this did not say
+# ## Limits of this example
 #
-# A link that forgives wild readings also forgives a wrong scene: readings that the optics cannot
+# A link that is robust to outliers also hides a wrong scene: readings that the optics cannot
 # explain look like bad ones. Where several neighbors are off together, ask for an effect that the
 # scene is missing rather than for longer tails; [effects](../effects.md) lists the candidates.
 # Models of your own: [swapping](../swapping.md) and [extending](../extending.md). Next: [many

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # River water: from the wrong scene to the right one
 #
-# A fit always returns numbers. This notebook begins with the scene that nobody chose, and lets the
-# sentences of the package lead to another. The index of water is known, 1.34; no fit is given it.
+# A fit always returns numbers. This notebook begins with the default scene, and follows the
+# messages of the package to a better one. The index of water is known, 1.34; no fit uses it.
 #
 # The measurements belong to others and are not part of this project. To run this notebook, set
 # `POLAR_BAYES_DATA` to a folder with `river_water/river_water_q.csv`: q of a river over the angle
@@ -50,7 +50,7 @@ print(*pb.verdict(first).sentences, sep="\n")
 
 # %% [markdown]
 # The chains may well have converged; the verdict still fails, because it judges the model, too.
-# Each sentence names what the readings say against it and ends with what to try.
+# Each sentence names a contradiction between readings and model and ends with a remedy.
 
 # %%
 checks = pb.diagnostics.criticize(first)
@@ -59,7 +59,7 @@ print(checks[["level", "p_value"]].round(4).to_string())
 # %% [markdown]
 # ## Which scene?
 #
-# `compare_scenes` grows scenes from the parts that this capture allows, fits each, and stops when
+# `compare_scenes` builds scenes from the parts that this capture allows, fits each, and stops when
 # nothing is left to explain or nothing predicts better.
 
 # %%
@@ -70,7 +70,7 @@ print(*pb.scenes.scene_sentences(comparison), sep="\n")
 # %% [markdown]
 # A river is lit by the whole sky, light comes back from below its surface, and the angle was not
 # set by a stage. The scenes that lack one of these predict the readings worse by many nats, and
-# their intervals of the index show what that would have cost:
+# their intervals of the index show the error that this causes:
 
 # %%
 index = comparison.intervals.loc["refractive_index"]

@@ -36,7 +36,7 @@ from polar_bayes.progress import Progress, no_progress, with_progress
 
 DIAGNOSTICS = ("r_hat", "pareto_k", "ess", "gradients", "densities")
 COSTS_OF_PROCESS = ("seconds_first", "peak_memory", "memory_before")
-"""Costs that are known only where a trial has a process of its own."""
+"""Costs that can be measured only for a trial that runs in its own process."""
 
 DESCRIPTIONS: Mapping[str, tuple[str, str]] = {
     "mean_error": ("posterior mean minus that of the reference, in its sds", "1"),
@@ -143,13 +143,13 @@ def accuracy(
 
 
 Trials = dict[tuple[str, str], Trial | PolarBayesError]
-"""A trial, or why it cannot be run, by names of method and override."""
+"""Trials by names of method and override; an error in place of a trial that cannot be run."""
 
 
 def _trials(
     request: Request, methods: Mapping[str, AbstractMethod], overrides: tuple[AbstractOverride, ...]
 ) -> Trials:
-    """Every method as given, then with every override that changes something."""
+    """List every method as given, and with every override that changes something."""
     if not isinstance(methods, Mapping) or not methods:
         hint = "give methods by name, as in STUDY_METHODS"
         raise FitError("there is no method", where="accuracy: methods", hint=hint)
@@ -173,7 +173,7 @@ def _trials(
 
 
 def _row(trial: Trial | PolarBayesError, reference: ReferenceRun, *, fresh: bool) -> dict[str, Any]:
-    """Distances, diagnostics and costs of one trial by name; NaN where it failed."""
+    """Return distances, diagnostics and costs of one trial by name; NaN where the trial failed."""
     row: dict[str, Any] = {
         **{name: np.full(len(reference.labels), np.nan) for name in DISTANCES},
         **dict.fromkeys((*DIAGNOSTICS, "seconds_again", *COSTS_OF_PROCESS), np.nan),

@@ -28,7 +28,7 @@ NUMBERS = (
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class AccuracyView:
-    """An accuracy study that was checked, and what is computed of it once."""
+    """A validated accuracy study with cached tables."""
 
     study: xr.Dataset
 
@@ -67,18 +67,18 @@ class AccuracyView:
 
     @property
     def is_given(self) -> np.ndarray:
-        """Which rows are of a method as it was given."""
+        """True for rows that show a method as it was given, (row,)."""
         return np.asarray(self.study["override"].to_numpy() == AS_GIVEN)
 
     @property
     def resolved(self) -> float:
-        """The error from which on one counts as different from 0, in reference sds."""
+        """The smallest error that differs significantly from 0, in reference sds."""
         # Twice the standard error of the reference.
         return 2.0 * float(self.study.attrs["reference_error"])
 
     @property
     def doubts(self) -> str:
-        """What speaks against the reference; empty where nothing does."""
+        """Reasons to doubt the reference, as text; empty without any."""
         return str(self.study.attrs["reference_doubts"])
 
     def _larger(self, *names: str) -> np.ndarray:
@@ -90,7 +90,7 @@ type Study = xr.DataTree | xr.Dataset | AccuracyView
 
 
 def accuracy_view(result: Study) -> AccuracyView:
-    """A view itself, or that of a study or of a fit that holds one, which is checked."""
+    """Return the view of a study, or of a fit that holds one, after checking it."""
     if isinstance(result, AccuracyView):
         return result
     if isinstance(result, xr.Dataset):
@@ -108,7 +108,7 @@ def accuracy_view(result: Study) -> AccuracyView:
 
 
 def accuracy_table(result: Study) -> pd.DataFrame:
-    """One row for each method and override, the errors of the worst parameter.
+    """Return one row per method and override, with the errors of its worst parameter.
 
     `error` is the largest of mean and sd in reference sds, `worst` the parameter that has it;
     `resolved`: it is more than twice the reference's own standard error; `interval` is the largest
@@ -118,7 +118,7 @@ def accuracy_table(result: Study) -> pd.DataFrame:
 
 
 def pareto_front(seconds: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Which rows are such that no other is at least as fast and as good, and better in one."""
+    """Return True for rows that no other row beats in time without a larger error, (row,)."""
     costs = np.stack([seconds, error], axis=1)
     known = np.isfinite(costs).all(axis=1)
     no_worse = (costs[:, None] <= costs).all(axis=2)
@@ -127,12 +127,12 @@ def pareto_front(seconds: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 
 def time_column(table: pd.DataFrame) -> str:
-    """The column of times that is filled in: of the first fit, where it was measured."""
+    """Return the name of the time column: time of the first fit, where it was measured."""
     return "seconds_first" if table["seconds_first"].notna().any() else "seconds_again"
 
 
 def accuracy_sentences(result: Study, tolerance: float = 0.1) -> list[str]:
-    """Which method to use for this capture.
+    """Return sentences that recommend a method for this capture.
 
     Args:
         result: What `polar_bayes.accuracy` returns, or one read back from a file.
@@ -153,7 +153,9 @@ def accuracy_sentences(result: Study, tolerance: float = 0.1) -> list[str]:
     view = accuracy_view(result)
     sentences = [_advice(view.table[view.is_given], view.errors[view.is_given], tolerance)]
     if view.doubts:
-        sentences.append(f"Take it with care: of the reference itself, {view.doubts}.")
+        sentences.append(
+            f"Use this advice with care, since the reference is in doubt: {view.doubts}."
+        )
     return sentences
 
 
@@ -194,7 +196,7 @@ def _advice(table: pd.DataFrame, errors: pd.DataFrame, tolerance: float) -> str:
 def _partly(
     errors: pd.DataFrame, seconds: pd.Series, fastest: str, tolerance: float
 ) -> tuple[str, list[str]] | None:
-    """The fastest row good for most parameters, and what it misses, if it is twice as fast."""
+    """Name the fastest row good for most parameters and what it misses, if it is twice as fast."""
     for name in seconds.sort_values(kind="stable").index:
         missed = [label for label, error in errors.loc[name].items() if not error <= tolerance]
         if seconds[fastest] < 2.0 * seconds[name]:

@@ -46,7 +46,7 @@ def distances(
 
 @dataclasses.dataclass(frozen=True)
 class Reference:
-    """Settings of the reference.
+    """Settings of the reference run of an accuracy study.
 
     Args:
         error: Largest Monte Carlo standard error of a mean or standard deviation, in posterior
@@ -70,7 +70,7 @@ class Reference:
 
     @property
     def chains(self) -> Nuts:
-        """The chains that are run first."""
+        """The method that runs first: NUTS chains."""
         goal = 2.0 / self.error**2
         draws = int(np.ceil(goal / 4.0))
         return Nuts(
@@ -84,14 +84,14 @@ class Reference:
 
     @property
     def weighted(self) -> Importance:
-        """The method that is tried where chains do not agree."""
+        """The method that runs if the chains disagree: weighted draws."""
         # Half of the effective draws is lost where draws are chosen by weight, and of all draws a
         # few tenths are effective.
         return Importance(draws=math.ceil(16.0 / self.error**2))
 
 
 class ReferenceRun(NamedTuple):
-    """A reference that was run; `biases` and `noise` are reasons to doubt it.
+    """A finished reference; `biases` and `noise` list reasons to doubt it.
 
     `wasserstein` is the distance of one half of its chains from the other, by parameter.
     """
@@ -108,7 +108,7 @@ class ReferenceRun(NamedTuple):
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """All reasons to doubt it; empty where there are none."""
+        """All reasons to doubt the reference; empty without any."""
         return (*self.biases, self.noise) if self.noise else self.biases
 
     @property
@@ -118,7 +118,7 @@ class ReferenceRun(NamedTuple):
 
 
 def run_reference(settings: Reference, problem: Problem, key: Array) -> ReferenceRun:
-    """Chains that are lengthened until their own error is small enough."""
+    """Run chains and lengthen them until their own error is small enough."""
     # Where they do not agree, or some of them missed a mode, weighted draws are tried, where the
     # capture allows it.
     runs = [_run_until(settings, "NUTS", settings.chains, problem, key)]
@@ -129,14 +129,14 @@ def run_reference(settings: Reference, problem: Problem, key: Array) -> Referenc
 
 
 def best_reference(runs: Sequence[ReferenceRun]) -> ReferenceRun:
-    """The run of fewest biases, then of least error: a noisy reference is preferred to a biased."""
+    """Return the run of fewest biases, and among those the one of smallest error."""
     return min(runs, key=lambda run: (len(run.biases), not run.error < np.inf, run.error))
 
 
 def _run_until(
     settings: Reference, name: str, method: AbstractMethod, problem: Problem, key: Array
 ) -> ReferenceRun:
-    """Four times the draws, until the error is as small as the settings ask."""
+    """Run a method, each time with four times the draws, until its error is small enough."""
     run = _run(settings, name, method, problem, key)
     for _ in range(settings.longer):
         longer = method.scale_draws(4.0)

@@ -1,4 +1,4 @@
-"""One method on one capture, run and measured: first with everything to compile, then again.
+"""Run and measure one method on one capture: once with compilation, then again without.
 
     python -m polar_bayes.benchmark.run TRIAL RESULT
 
@@ -47,7 +47,7 @@ except ImportError:  # not on Windows, where memory is then not known
 
 
 class Trial(NamedTuple):
-    """A method, and the request that it is run on."""
+    """A method and the request to which it is applied."""
 
     request: Request
     method: AbstractMethod
@@ -85,13 +85,13 @@ def run_trial(trial: Trial) -> TrialResult:
 def labeled(
     problem: Problem, z: Float[np.ndarray, "chain draw size"]
 ) -> tuple[tuple[str, ...], Float[np.ndarray, "parameter chain draw"]]:
-    """Labels and values of the parameters of draws."""
+    """Return labels, and values (parameter, chain, draw), of all scalar parameters."""
     found = scalars(posterior_of(problem.program, problem.constrain(z)))
     return tuple(each.label for each in found), np.stack([each.draws for each in found])
 
 
 def _run(trial: Trial, seed: int) -> tuple[PosteriorDraws, tuple[str, ...], np.ndarray]:
-    """The draws of a method, and their parameters with labels."""
+    """Run the method of a trial; return its draws, and labels and values of the parameters."""
     key_search, key_draws = jax.random.split(jax.random.key(seed))
     problem = make_problem(trial.request, key_search)
     found = trial.method.run(problem, key_draws, no_progress)
@@ -101,7 +101,7 @@ def _run(trial: Trial, seed: int) -> tuple[PosteriorDraws, tuple[str, ...], np.n
 
 
 def sample_point(found: PosteriorDraws, key: Array, count: int = 1000) -> PosteriorDraws:
-    """Draws of the normal distribution that the standard errors of a point estimate stand for."""
+    """Draw from the normal distribution given by the standard errors of a point estimate."""
     # What the readings do not determine has no standard error, and is drawn without any width.
     covariance = np.asarray(found.covariance)
     free = np.isinf(np.diagonal(covariance))
@@ -149,14 +149,14 @@ def run_in_subprocess(trial: Trial) -> TrialResult:
 
 
 def _environment() -> dict[str, str]:
-    """That of this process, without its store of compiled programs."""
+    """Return this process's environment variables, without its cache of compiled programs."""
     kept = {name: value for name, value in os.environ.items() if "COMPILATION_CACHE" not in name}
     path = os.pathsep.join(part or os.getcwd() for part in sys.path)
     return kept | {"PYTHONPATH": path, "JAX_ENABLE_COMPILATION_CACHE": "false"}
 
 
 def _run_file(source: Path, target: Path) -> None:
-    """What the new process does."""
+    """Run a pickled trial and pickle its result; the new process calls this."""
     try:
         found: TrialResult | PolarBayesError = run_trial(pickle.loads(source.read_bytes()))
     except PolarBayesError as error:
@@ -169,16 +169,16 @@ def _run_file(source: Path, target: Path) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class AbstractOverride(abc.ABC):
-    """One setting that is not the method, changed one way."""
+    """A change of one setting other than the method, such as half the facets."""
 
     @property
     @abc.abstractmethod
     def name(self) -> str:
-        """What it is called beside the method: `facets / 2`."""
+        """Name of the change in tables, such as `facets / 2`."""
 
     @abc.abstractmethod
     def apply(self, request: Request, method: AbstractMethod) -> Trial | None:
-        """What is fitted then.
+        """Apply the change to a request and a method.
 
         Args:
             request: As it was asked.
@@ -194,7 +194,7 @@ class AbstractOverride(abc.ABC):
 
 @dataclasses.dataclass(frozen=True)
 class _Factor(AbstractOverride):
-    """So many times of something that `what` names."""
+    """A change that multiplies one number, which `what` names, by a factor."""
 
     factor: float
     what: ClassVar[str]
@@ -215,7 +215,7 @@ class _Factor(AbstractOverride):
 
 @dataclasses.dataclass(frozen=True)
 class DrawsOverride(_Factor):
-    """So many times the draws; left out where a method cannot have about as many.
+    """A multiple of the draws; skipped where a method cannot make about as many.
 
     Args:
         factor: Above 0.
@@ -323,14 +323,15 @@ OVERRIDES: tuple[AbstractOverride, ...] = (
     EffectsOverride(),
     PrecisionOverride(),
 )
-"""What every method is crossed with, one at a time."""
+"""The overrides that are applied to every method, one at a time."""
 
 _CHOSEN: LRUCache[Scene | PolarBayesError] = LRUCache(2)
-"""Choices take minutes, and every method asks. One that failed would fail again."""
+"""Chosen scenes by request: a choice takes minutes, and every method asks for it. Failures are
+stored, too, since they would fail again."""
 
 
 def _choose(request: Request, tolerance: float) -> Scene | PolarBayesError:
-    """The scene that `polar_bayes.choose_effects` chooses, or why it cannot."""
+    """Return the scene that `polar_bayes.choose_effects` chooses, or the error that it raises."""
     plain = simplify(request.scene, ())
     swapped = (name.rpartition("prior of ") for name in request.swapped)  # by the user
     priors = {name: request.priors[name] for _, found, name in swapped if found}

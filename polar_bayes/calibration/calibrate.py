@@ -58,7 +58,7 @@ def calibrate(
     scheduler: str | None = None,
     progress: Counter | None = None,
 ) -> xr.DataTree:
-    """Simulation-based calibration: do the intervals of this fit have their nominal coverage?
+    """Test by simulation whether the intervals of a fit have their nominal coverage.
 
     Parameters are drawn from the prior and captures from the likelihood, each is fitted, and the
     truth is ranked among the draws. Where model, prior and sampler are right the ranks are uniform
@@ -134,7 +134,7 @@ def _check_size(simulations: int, store: object, resume: bool) -> None:
 def _requests(
     capture: xr.Dataset, asked: dict[str, Any], truth: Mapping[str, Any], limits: dict[str, Any]
 ) -> tuple[Request, Request | None]:
-    """That of the fits, and that of the data where they are simulated by another."""
+    """Return the request of the fits, and that of the simulated data where it differs."""
     if unknown := set(truth) - set(asked):
         what = f"{', '.join(sorted(unknown))} cannot differ"
         raise FitError(what, where="calibrate: truth", hint=f"give some of {', '.join(asked)}")
@@ -145,7 +145,7 @@ def _requests(
 def _provenance(
     plan: CalibrationPlan, truth: Mapping[str, Any], simulations: int, forecast: str, found: int
 ) -> dict[str, Any]:
-    """What a calibration states about how it was made."""
+    """Describe how a calibration was made, in what JSON can hold."""
     optional = {
         "forecast": forecast,
         "fits found in the store": found,
@@ -168,7 +168,7 @@ def make_plan(
     settings: AbstractBatchMethod,
     readings: bool,
 ) -> CalibrationPlan:
-    """What is done to every block; without a generative request, the fitted model simulates."""
+    """Check and combine the requests; without a generative one, the fitted model simulates."""
     own_key = layout_key(request, request.largest_view_zenith)
     generative_key = "" if generative_request is None else layout_key(generative_request)
     key = tokenize(own_key, generative_key, repr(settings), readings, tokenize(request.capture))
@@ -188,7 +188,7 @@ def _fit_all(
     progress: Counter | None,
     forecast: "Forecast",
 ) -> tuple[xr.DataTree, int]:
-    """The groups of a calibration, and how many of its fits were in the store."""
+    """Fit all simulations; return the calibration, and how many fits were in the store."""
     blocks = [] if store is None else store.blocks()
     stored = np.concatenate([*map(numbers_of, blocks), []])
     missing = np.setdiff1d(np.arange(simulations), stored).astype(int)
@@ -208,7 +208,7 @@ def _fit_all(
 
 @dataclasses.dataclass
 class Forecast:
-    """Of a calibration that takes long: how long, and how a faster method fits the same.
+    """Forecast of the remaining time, and of a faster method's results on the same simulations.
 
     It is made after `pilot` fits, where those that are left take `long` seconds or more.
     """
@@ -222,7 +222,7 @@ class Forecast:
     _begin: float = 0.0
 
     def see(self, block: xr.DataTree, left: int) -> None:
-        """Take in a finished block; once there are enough, say what can be said."""
+        """Take in a finished block, and announce the forecast once enough blocks are finished."""
         self._seen.append(block)
         if len(self._seen) == 1:  # its programs are compiled
             self._begin = time.perf_counter()
@@ -237,7 +237,7 @@ class Forecast:
             notice(self.sentence)
 
     def _faster(self, left: int) -> str:
-        """What the faster method makes of the same simulations."""
+        """Fit the same simulations by the faster method, and describe its time and results."""
         plan = dataclasses.replace(self.plan, settings=make_method(self.faster), readings=False)
         own = join(self._seen, sys.maxsize)
         numbers = numbers_of(own)
@@ -250,6 +250,6 @@ class Forecast:
         moved = [(abs(two[name] - one[name]) / one[f"{name}_sd"]).values for name in own["truth"]]
         largest = max((np.max(each, initial=0.0) for each in moved), default=0.0)
         return (
-            f", by {self.faster} about {max(minutes, 0.1):.2g} min; both vouch for {both.sum()} of "
+            f", by {self.faster} about {max(minutes, 0.1):.2g} min; both trust {both.sum()} of "
             f"{len(both)}, whose means differ by at most {largest:.2g} sd"
         )

@@ -34,10 +34,10 @@ from polar_bayes.observation.data import Observations
 Arrays = dict[str, np.ndarray]
 
 DRAWS = 128
-"""Draws of each fit: its weighted draws resampled to this number of equally weighted ones."""
+"""Equally weighted draws to which the weighted draws of each fit are resampled."""
 
 DRAW_BATCH = 32
-"""Draws of a fit that are evaluated at once."""
+"""Draws of one fit that are evaluated together."""
 
 
 class PredictivePit:
@@ -95,7 +95,7 @@ class PredictivePit:
                 values[name][at] = np.where(is_valid, part, np.nan)
 
     def _predict(self, at: np.ndarray, latent: Values) -> tuple[Arrays, Arrays]:
-        """Predictions of the chosen entries and their log likelihoods: by name, (fit, draw)."""
+        """Predict the chosen entries; return predictions and log likelihoods, each (fit, draw)."""
         entry = {name: np.maximum(x[at], 0).astype(np.int32) for name, x in self.entry.items()}
         states = (entry, latent, self._keys[at])
         some = self._batch.subset(at)
@@ -108,7 +108,7 @@ def unranked_reason(
     data: Observations,
     parameters: Mapping[str, tuple[int, ...]],
 ) -> str:
-    """Why readings of this model cannot be ranked; empty where they can."""
+    """Explain why readings of this model cannot be ranked; empty where they can."""
     missing = [name for name in program.supports if name not in parameters]
     if missing:
         return f"draws do not hold {', '.join(missing)}, without which the model predicts nothing"
@@ -126,7 +126,7 @@ def unranked_reason(
 
 
 def _predictor(engine: CompiledModel, names: tuple[str, ...]) -> JitOnce:
-    """Compiled: predictions of the chosen entries by draws of one fit, and log likelihoods."""
+    """Compile the predictions of chosen entries from draws of one fit, with log likelihoods."""
     program = engine.single_program
 
     def predict(
@@ -157,7 +157,7 @@ def _predictor(engine: CompiledModel, names: tuple[str, ...]) -> JitOnce:
 
 
 def _choose(valid: np.ndarray, uniform: np.ndarray) -> np.ndarray:
-    """The index of one valid entry of each row, all equally likely; -1 where there is none."""
+    """Return the index of a random valid entry of each row; -1 where a row has none."""
     count = valid.sum(axis=-1)
     rank = np.minimum((uniform * count).astype(int), count - 1)
     entry = np.argmax(np.cumsum(valid, axis=-1) > rank[:, None], axis=-1)
@@ -170,6 +170,6 @@ def _take(values: Array | np.ndarray, entry: np.ndarray) -> np.ndarray:
 
 
 def _resample(weights: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Systematic resampling: indices of equally weighted draws, (fit, DRAWS)."""
+    """Return indices of equally weighted draws by systematic resampling, (fit, DRAWS)."""
     levels = (np.arange(DRAWS) + first[:, None]) / DRAWS
     return np.stack([draws_at(*row) for row in zip(levels, weights, strict=True)])

@@ -67,7 +67,7 @@ def proxy_scores(
     results: Sequence[xr.DataTree],
     proxies: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
 ) -> pd.DataFrame:
-    """Position of the proxy of every parameter in its posterior, fit by fit.
+    """Return the quantile of each parameter's proxy in its posterior, fit by fit.
 
     Args:
         results: Trees of `polar_bayes.fit`.
@@ -108,7 +108,7 @@ def proxy_coverage(
     results: Sequence[xr.DataTree],
     proxies: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
 ) -> pd.DataFrame:
-    """How often the intervals of fits of real captures hold a proxy of the truth.
+    """Return how often intervals of fits of real captures contain a proxy of the truth.
 
     A proxy, such as the index in a data sheet, has an error of its own that these numbers do not
     include: where it is as large as the intervals, coverage is below the nominal one.
@@ -177,13 +177,13 @@ def _conclusion(row: pd.Series, level: float) -> str:
     if row["repeats"] < 2:
         return "too few repeats have an answer"
     if row["p_value"] < level:
-        return f"repeats scatter {row['ratio']:.1f} times more than the intervals say"
+        return f"repeats scatter {row['ratio']:.1f} times more than the intervals predict"
     if row["p_value"] > 1.0 - level:
         return (
-            f"repeats scatter only {row['ratio']:.2g} times as much as the intervals say: the rest "
-            "of the intervals is what all repeats share"
+            f"repeats scatter only {row['ratio']:.2g} times as much as the intervals predict: the "
+            "rest of the intervals is what all repeats share"
         )
-    return "repeats scatter about as much as the intervals say"
+    return "repeats scatter about as much as the intervals predict"
 
 
 def _position(proxy: float, draws: np.ndarray) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Blocks of simulations of a calibration: simulated, fitted and ranked, in any process, and stored.
+"""Blocks of simulations of a calibration: simulate, fit, rank and store them, in any process.
 
 Source:
     Talts, Betancourt, Simpson, Vehtari & Gelman (2018), arXiv:1804.06788.
@@ -49,7 +49,7 @@ from polar_bayes.physics.part import notation
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CalibrationPlan:
-    """What is done to every block of one calibration; it can be sent to another process."""
+    """Everything that defines the fits of a calibration; it can be sent to another process."""
 
     request: Request
     generative_request: Request | None
@@ -60,18 +60,18 @@ class CalibrationPlan:
 
     @property
     def compiled(self) -> "CompiledPlan":
-        """Its programs, which the next calibration of the same model finds in this process."""
+        """Compiled programs; the next calibration of the same model reuses them."""
         return _COMPILED.of(self.key, lambda: CompiledPlan(self))
 
     @property
     def block(self) -> int:
-        """Simulations of a block."""
+        """Number of simulations of a block."""
         return self.settings.group_size
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CompiledPlan:
-    """The programs of a plan, each made at its first use."""
+    """The compiled programs of a plan, each made at its first use."""
 
     plan: CalibrationPlan
 
@@ -83,13 +83,13 @@ class CompiledPlan:
 
     @functools.cached_property
     def engine(self) -> CompiledModel:
-        """The programs that fit captures."""
+        """The compiled model that fits captures."""
         plan = self.plan
         return compile_layout(plan.layout_key, plan.request, lambda: self.data)
 
     @functools.cached_property
     def generative_program(self) -> Program:
-        """The model by which captures are simulated."""
+        """The model from which captures are simulated, as functions of one vector."""
         request = self.plan.generative_request
         if request is None:
             return self.engine.program
@@ -105,7 +105,7 @@ class CompiledPlan:
 
     @functools.cached_property
     def unranked_reason(self) -> str:
-        """Why readings cannot be ranked; empty where they can, or where none are to be."""
+        """Reason why readings cannot be ranked; empty where they can or need not be."""
         if not self.plan.readings:
             return ""
         program, given = self.engine.program, _shapes(self.engine.program, self.data)
@@ -117,7 +117,7 @@ _COMPILED: LRUCache[CompiledPlan] = LRUCache(4)
 
 
 def fit_block(plan: CalibrationPlan, numbers: np.ndarray) -> xr.DataTree:
-    """The calibration by some simulations, NaN where a fit has no answer; a worker is sent this."""
+    """Simulate and fit some captures, as workers do; NaN where a fit has no answer."""
     # The result of a simulation depends on its number alone, not on the others of its block.
     compiled, seed, count = plan.compiled, plan.request.seed, len(numbers)
     program, data, shared = compiled.generative_program, compiled.data, compiled.shared
@@ -196,8 +196,8 @@ def _label_groups(
 def _label_readings(
     ranked: PredictivePit, data: Observations, numbers: np.ndarray
 ) -> dict[str, xr.Dataset]:
-    """PIT values of readings, which readings they are, and Pareto k of leaving them out."""
-    k_name = f"Pareto k of the weights without it; above {MAX_PARETO_K} they say little"
+    """Label PIT values of readings, their indices, and Pareto k of leaving each one out."""
+    k_name = f"Pareto k of the weights without it; above {MAX_PARETO_K} they are unreliable"
     chosen: dict[str, tuple] = {}
     for name, entry in ranked.entry.items():
         k = ranked.left_out_k[name]
@@ -219,7 +219,7 @@ def _label_readings(
 
 
 def join(blocks: Sequence[xr.DataTree], count: int) -> xr.DataTree:
-    """The first simulations of a calibration as one block, in order."""
+    """Combine blocks into one, ordered by simulation, up to a number of simulations."""
     groups = {}
     for name in blocks[0].children:
         whole = xr.concat(
@@ -236,18 +236,18 @@ def join(blocks: Sequence[xr.DataTree], count: int) -> xr.DataTree:
 
 
 def numbers_of(block: xr.DataTree) -> np.ndarray:
-    """The numbers of the simulations of a block."""
+    """Return the numbers of the simulations of a block."""
     return block["fits"]["simulation"].to_numpy()
 
 
 def cut(numbers: np.ndarray, size: int) -> list[np.ndarray]:
-    """Numbers of simulations in ascending order, a part for each block."""
+    """Split ascending simulation numbers into one array per block."""
     ends = np.flatnonzero(np.diff(numbers // size)) + 1
     return [part for part in np.split(numbers, ends) if part.size]
 
 
 def _shapes(program: Program, data: Observations) -> dict[str, tuple[int, ...]]:
-    """Of the parameters of a model, in the order of their names."""
+    """Return the shapes of a model's parameters by name, in alphabetical order."""
     with jax.enable_x64(True), TRACING_LOCK:
         found = jax.eval_shape(program.parameters, jnp.zeros(program.size), data)
     return {name: found[name].shape for name in sorted(found)}
@@ -283,7 +283,7 @@ def draw_captures(
 
 
 def _simulator(program: Program, replicate: bool) -> JitOnce:
-    """Compiled: parameters and readings of many captures."""
+    """Compile the simulation of many captures: parameters from the prior, and readings."""
     # Where intensity is recorded, each capture's own brightness sets its noise, and readings at
     # full scale are saturated.
 
@@ -306,7 +306,7 @@ def _simulator(program: Program, replicate: bool) -> JitOnce:
 
 
 def _recorded(data: Observations, readings: Mapping[str, Any]) -> Observations:
-    """A capture with other readings; where a view is not valid, those of `data` remain."""
+    """Replace the readings of a capture; views that are not valid keep the readings of `data`."""
     valid = {n: jnp.where(data.valid, x, data.readings[n]) for n, x in readings.items()}
     capture = dataclasses.replace(data, readings={**data.readings, **valid})
     if "intensity" not in valid:
@@ -336,7 +336,7 @@ LIBRARIES = ("polar_bayes", "jax", "jaxlib", "numpyro", "numpy", "scipy")
 
 @contextlib.contextmanager
 def open_store(folder: Path, plan: CalibrationPlan, resume: bool) -> Iterator["BlockStore"]:
-    """The blocks of a calibration in a folder, which is made, or read where it is resumed."""
+    """Create the folder of a calibration's blocks, or open it to resume."""
     where = str(folder)
     if not resume and folder.exists():
         raise OutputError("it is there already", where=where, hint=RESUME)
@@ -357,13 +357,13 @@ def open_store(folder: Path, plan: CalibrationPlan, resume: bool) -> Iterator["B
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BlockStore:
-    """A folder of blocks, each in a file that is there whole or not at all."""
+    """A folder of blocks, each of which is one file that is written atomically."""
 
     folder: Path
     journal: Journal
 
     def blocks(self) -> list[xr.DataTree]:
-        """The finished blocks; those whose files are lost or damaged are fitted again."""
+        """Read the finished blocks; those with lost or damaged files are fitted again."""
         found = []
         for path in sorted(self.folder.glob(BLOCK_FILE)):
             broken = FitError("it cannot be read", where=str(path), hint=RESUME)
@@ -373,7 +373,7 @@ class BlockStore:
         return found
 
     def add(self, block: xr.DataTree) -> None:
-        """Write a block, named by the numbers of its first and last simulation."""
+        """Write a block to a file named by the numbers of its first and last simulation."""
         numbers = numbers_of(block)
         path = self.folder / f"{numbers.min():08d}-{numbers.max():08d}.nc"
         with written(self.folder), temporary_folder(self.folder) as unfinished:
@@ -383,7 +383,7 @@ class BlockStore:
 
 
 def topics_of(plan: CalibrationPlan) -> dict[str, str]:
-    """One text per topic that determines the fits; their number may differ between runs."""
+    """Return a text per topic that determines the fits, without the number of simulations."""
     truth = request_topics(plan.generative_request) if plan.generative_request is not None else {}
     data = plan.compiled.data
     return {

@@ -50,7 +50,7 @@ def randomized_pit(
     uniform: Float[np.ndarray, " fit"],
     count: int | None = None,
 ) -> Float[np.ndarray, " fit"]:
-    """Weighted share of draws below a value, uniform over ties and over the gap it falls into."""
+    """Return the weighted share of draws below each value, randomized over ties and gaps."""
     # The gap is as wide as between `count` draws of equal weight, by default as many as the weights
     # are worth: where a value is one more draw of the same distribution, this has the variance of a
     # uniform number, however few they are.
@@ -79,13 +79,13 @@ NULL_SAMPLES = 9999
 """Uniform samples that give the null distribution: p-values are multiples of a ten-thousandth."""
 
 MAX_POINTS = 200
-"""Points at which the empirical distribution is evaluated, at most."""
+"""Largest number of points at which the empirical distribution is evaluated."""
 
 SEED = 20
 
 
 class Uniformity(NamedTuple):
-    """Result of the test, and moments of the sample: the spread of a uniform one is 1."""
+    """Result of a test of uniformity, with mean and relative spread (1 if uniform)."""
 
     p_value: float
     mean: float
@@ -127,7 +127,7 @@ def binomial_p_values(count: int, points: int) -> Float[np.ndarray, "outcome poi
 
 @functools.lru_cache(maxsize=4)
 def null_statistics(count: int) -> Float[np.ndarray, " null"]:
-    """Statistics of uniform samples of this size, in ascending order."""
+    """Return ascending statistics of uniform samples of this size."""
     random = np.random.default_rng(SEED)
     sizes = np.diff(np.linspace(0, NULL_SAMPLES, 11).astype(int))  # in parts, to save memory
     return np.sort(np.concatenate([_smallest_p_value(random.random((n, count))) for n in sizes]))
@@ -142,7 +142,7 @@ class EcdfBand(NamedTuple):
 
 
 def ecdf_band(count: int, level: float) -> EcdfBand:
-    """The band that a curve leaves exactly where `uniformity` has a p-value below the level."""
+    """Return the band that a curve leaves exactly if `uniformity` has a p-value below `level`."""
     table = binomial_p_values(count, min(count, MAX_POINTS))
     # A p-value is (1 + null statistics up to the observed one) / (1 + NULL_SAMPLES): below the
     # level are the observed statistics that are smaller than the null statistic of this rank.
@@ -157,7 +157,7 @@ def ecdf_band(count: int, level: float) -> EcdfBand:
 
 
 def histogram_band(count: int, bins: int, level: float = 0.05) -> tuple[float, float]:
-    """Densities between which all bars of a uniform histogram lie (Bonferroni)."""
+    """Return densities that bound all bars of a uniform sample's histogram (Bonferroni)."""
     tail = level / (2 * bins)
     low, high = scipy.stats.binom.ppf([tail, 1.0 - tail], count, 1.0 / bins)
     return float(low) * bins / count, float(high) * bins / count
@@ -167,7 +167,7 @@ def histogram_band(count: int, bins: int, level: float = 0.05) -> tuple[float, f
 
 
 def coverage_p_value(held: int, count: int, share: float) -> float:
-    """Two-sided exact binomial test of how many intervals hold the truth; NaN without any."""
+    """Two-sided exact binomial test of the coverage of intervals; NaN without intervals."""
     return float(scipy.stats.binomtest(held, count, share).pvalue) if count else math.nan
 
 
@@ -190,25 +190,25 @@ def spread_of_scores(pit: Float[np.ndarray, " size"]) -> tuple[float, float]:
 # --- Several p-values as one test -----------------------------------------------------------------
 
 FALSE_ALARMS = 0.05
-"""Probability, at most, that a correct model, prior, link and method fail a joint test."""
+"""Largest probability that a correct model, prior, link and method fail a joint test."""
 
 
 TESTS = ("p_value", "p_held_50", "p_held_80", "p_held_95", "p_spread")
-"""Columns of p-values: of uniform ranks, of the coverage of intervals, and of the spread."""
+"""Columns of p-values: uniformity of ranks, coverage of intervals, and spread."""
 
 
 def p_values(table: pd.DataFrame) -> pd.DataFrame:
-    """Every p-value of a table: of parameters by five tests, of readings by their ranks alone."""
+    """Return all p-values of a table: five per parameter, one per reading."""
     return table[[test for test in TESTS if test in table]]
 
 
 def significance_level(table: pd.DataFrame) -> float:
-    """Level of each test of each row: the false-alarm rate over the number of all tests."""
+    """Return the level of each single test: the false-alarm rate over the number of tests."""
     return FALSE_ALARMS / p_values(table).size
 
 
 def is_calibrated(table: pd.DataFrame) -> bool:
-    """Whether ranks, coverage and spread pass the joint test, with at most 5% of false alarms.
+    """Return whether all tests pass jointly, at most 5% of which are false alarms.
 
     Args:
         table: Of `calibration_table`, or of `calibration_readings`, which are judged by their ranks

@@ -1,4 +1,4 @@
-"""What a calibration holds in a file, its tables, and the sentences that state what they mean."""
+"""Schema of a calibration in a file, its tables, and its verdict in sentences."""
 
 import dataclasses
 import functools
@@ -82,7 +82,7 @@ CALIBRATION = Schema(
 
 
 def check_calibration(tree: xr.DataTree, source: str = "calibration") -> None:
-    """Refuse what is no calibration, or does not hold together."""
+    """Raise FitError for a tree that is not a calibration or whose parts do not match."""
     CALIBRATION.check(tree, source)
     levels = tree["marginals"].to_dataset()["quantile"].to_numpy().tolist()
     if missing := [level for level in LEVELS if levels.count(level) != 1]:
@@ -97,13 +97,13 @@ def check_calibration(tree: xr.DataTree, source: str = "calibration") -> None:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CalibrationView:
-    """A calibration that was checked; the tree must not change while the view is in use."""
+    """A validated calibration; the tree must not change while the view is in use."""
 
     tree: xr.DataTree
 
     @functools.cached_property
     def scalars(self) -> list[tuple[Scalar, np.ndarray]]:
-        """Every scalar, whose draws are its ranks by simulation, with its truths."""
+        """Every scalar parameter, with its ranks by simulation as draws, and its truths."""
         ranks, truths = (
             scalars(self.tree[group].to_dataset().rename(simulation="draw").expand_dims("chain"))
             for group in ("prior_sbc", "truth")
@@ -124,7 +124,7 @@ class CalibrationView:
 
 
 def calibration_view(calibration: xr.DataTree | CalibrationView) -> CalibrationView:
-    """A view itself, or that of a tree, which is checked."""
+    """Return the view of a calibration after checking it."""
     if isinstance(calibration, CalibrationView):
         return calibration
     check_calibration(calibration)
@@ -134,7 +134,7 @@ def calibration_view(calibration: xr.DataTree | CalibrationView) -> CalibrationV
 # --- Tables ---------------------------------------------------------------------------------------
 
 HALF = 0.5
-"""Share of fits that have failed, or are not trusted, from which another method is named."""
+"""Share of failed or untrusted fits from which the verdict suggests another method."""
 
 MOMENT_LIMIT = 2.5
 """Standard errors from which a moment of the ranks is named as the deviation."""
@@ -142,11 +142,11 @@ MOMENT_LIMIT = 2.5
 TOO_FEW = "fewer than two fits have an answer"
 
 READING_TESTS = {"predictive_pit": "fresh", "loo_pit": "left out"}
-"""The groups of a calibration that hold PIT values of readings, and the names of their tests."""
+"""Groups of a calibration that hold PIT values of readings, and names of their tests."""
 
 
 def calibration_table(calibration: xr.DataTree | CalibrationView) -> pd.DataFrame:
-    """One row for each parameter of a calibration."""
+    """Return one row for each parameter of a calibration."""
     # Columns: `answered` and `failed` fits; `p_value` of uniform ranks; `rank_mean` (a half where
     # the posterior is neither too high nor too low) and `rank_spread` (above one: too narrow); for
     # 50, 80 and 95%, as `held_50`, the share of all fits whose interval holds the truth, failed
@@ -195,7 +195,7 @@ def _rank_columns(pit: np.ndarray) -> dict[str, float]:
 
 
 def calibration_readings(calibration: xr.DataTree | CalibrationView) -> pd.DataFrame:
-    """Two rows for each recorded variable: a replicated reading, and one left out of the fit.
+    """Return two rows per recorded variable: one of replicated readings, one left out.
 
     Where model, prior, links and method are right, both have uniform PIT values in the fits'
     predictions. One entry is chosen in each simulation, so that simulations are independent and the
@@ -236,12 +236,12 @@ def calibration_readings(calibration: xr.DataTree | CalibrationView) -> pd.DataF
 
 
 def holds_readings(calibration: xr.DataTree) -> bool:
-    """Whether readings were ranked in a calibration."""
+    """Return whether a calibration holds ranks of readings."""
     return set(READING_TESTS) <= set(calibration.children)
 
 
 def reading_ranks(calibration: xr.DataTree) -> dict[str, np.ndarray]:
-    """Ranks of readings by their label in `calibration_readings`, NaN where a fit has failed."""
+    """Return ranks of readings by their label in `calibration_readings`; NaN for failed fits."""
     return {
         f"{name}, {test}": calibration[group][name].to_numpy()
         for name in map(str, calibration["predictive_pit"].data_vars)
@@ -253,7 +253,7 @@ def reading_ranks(calibration: xr.DataTree) -> dict[str, np.ndarray]:
 
 
 def calibration_verdict(calibration: xr.DataTree | CalibrationView) -> list[str]:
-    """The result of a calibration, in sentences; readings, which are tested separately, last."""
+    """State the result of a calibration in sentences, readings last."""
     calibration = calibration_view(calibration)
     table = calibration.table
     passed = is_calibrated(table)
@@ -284,9 +284,9 @@ def calibration_verdict(calibration: xr.DataTree | CalibrationView) -> list[str]
         sentences.append(f"Half of the fits or more have failed: {advice}.")
     if np.mean(statuses == Status.NOT_TRUSTED) > HALF:
         sentences.append(
-            "Most fits say themselves that they cannot be trusted: the ranks judge the method, not "
-            "the model. Another method or longer chains may do; chains (method='nuts') are the "
-            "slowest and the surest."
+            "Most fits fail their own diagnostics: the ranks test the method, not the model. Use "
+            "another method or longer chains; chains (method='nuts') are the slowest and the most "
+            "reliable method."
         )
     return sentences + _reading_sentences(calibration)
 
@@ -299,7 +299,7 @@ def _reading_sentences(calibration: CalibrationView) -> list[str]:
     names = ", ".join(dict.fromkeys(table["reading"]))
     sentences = [
         f"Readings ({names}; fresh ones and ones left out) "
-        f"{'pass' if is_calibrated(table) else 'fail'} a joint test of their own that a right "
+        f"{'pass' if is_calibrated(table) else 'fail'} a separate joint test that a right "
         f"model fails {FALSE_ALARMS:.0%} of the time."
     ]
     for label, row in table.iterrows():
@@ -308,14 +308,14 @@ def _reading_sentences(calibration: CalibrationView) -> list[str]:
             sentences.append(f"{label}: {reading_deviation(row)}{p_value}.")
     sentences += [
         f"{label}: in {int(row['untrusted'])} of {int(row['answered'])} fits the weights "
-        f"without it say little (Pareto k above {MAX_PARETO_K:g})."
+        f"without it are unreliable (Pareto k above {MAX_PARETO_K:g})."
         for label, row in table[table["untrusted"] > 0].iterrows()
     ]
     return sentences
 
 
 def parameter_deviation(row: pd.Series, level: float) -> str:
-    """Which tests a parameter fails at a level, by how much; empty where it passes all."""
+    """Describe which tests a parameter fails, and by how much; empty if it passes all."""
     count = row["answered"]
     if count < 2:
         return TOO_FEW
@@ -341,7 +341,7 @@ def parameter_deviation(row: pd.Series, level: float) -> str:
 
 
 def reading_deviation(row: pd.Series) -> str:
-    """How the ranks of a reading deviate from the uniform distribution."""
+    """Describe how the ranks of a reading deviate from the uniform distribution."""
     return _deviation(row, 1.0, "predictions are", "predictions")
 
 
@@ -368,7 +368,7 @@ def _deviation(row: pd.Series, expected_spread: float, location: str, width: str
 
 
 def _spread_of_shifted(mean: float) -> float:
-    """Spread of the ranks where posteriors are shifted and of the right width: it is below 1."""
+    """Return the spread of ranks, below 1, of shifted posteriors of correct width."""
     # With normal posteriors ranks are Phi(z), z of variance one and mean sqrt(2) Phi^-1(mean);
     # their second moment is in Owen's T function (Owen 1980, Commun. Stat. B 9, 389-419).
     height = scipy.stats.norm.ppf(np.clip(mean, 1e-6, 1.0 - 1e-6))
@@ -436,7 +436,7 @@ def compare_calibrations(
 
 
 def comparison_sentences(compared: pd.DataFrame) -> list[str]:
-    """Which parameters fail by which method, how, and the result of the other methods.
+    """State which parameters fail by which method, and how, and who passes.
 
     Args:
         compared: Of `compare_calibrations`.
@@ -465,7 +465,7 @@ def comparison_sentences(compared: pd.DataFrame) -> list[str]:
 def _score_change(
     calibration: xr.DataTree, baseline: xr.DataTree, scalar: Scalar
 ) -> tuple[float, float]:
-    """Mean CRPS over that of the baseline, minus one, and its standard error."""
+    """Return the relative change of the mean CRPS from the baseline, and its standard error."""
 
     def values(tree: xr.DataTree, group: str, name: str) -> np.ndarray:
         return tree[group][name].isel(dict(scalar.index)).to_numpy().astype(float)

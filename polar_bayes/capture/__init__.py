@@ -1,4 +1,4 @@
-"""Measurements: what a capture holds, and the doors through which it enters."""
+"""Measurements: the contract of a capture, validation, and files."""
 
 from polar_bayes.namespace import attach
 

@@ -1,4 +1,4 @@
-"""Several captures combined along a leading dim, material or patch, to be fitted together."""
+"""Combine captures along a leading dim, material or patch, to fit them together."""
 
 from collections.abc import Hashable, Mapping, Sequence
 
@@ -20,7 +20,7 @@ PER_VIEW = tuple(row.name for row in CONTRACT if row.kind in ("geometry", "trust
 def combine(
     captures: Mapping[str, xr.Dataset], *, dim: str = "material", drop: Sequence[str] = ()
 ) -> xr.Dataset:
-    """One capture that holds several, along a leading dim.
+    """Combine captures into one along a leading dim.
 
     All must have the same readings, wavelengths, units and saturation level: a fit shares the
     instrument and the noise among them. Directions may differ, and so may the number of views:
@@ -62,7 +62,7 @@ def combine(
 def _checked(
     captures: Mapping[str, xr.Dataset], dim: str, drop: Sequence[str]
 ) -> dict[str, xr.Dataset]:
-    """The captures, validated, none with a leading dim."""
+    """Validate the captures, and refuse those with a leading dim."""
     if dim not in DIMS:
         hint = f"give {' or '.join(map(repr, DIMS))}"
         what = "captures do not stand side by side along that"
@@ -90,7 +90,7 @@ def _checked(
 
 
 def _check_variables(label: str, capture: xr.Dataset, first: str, pattern: xr.Dataset) -> None:
-    """Refuse a capture whose readings, directions or units are not those of the first."""
+    """Refuse a capture whose variables or units differ from those of the first."""
     where = f"combine: {label}"
     for name in dict.fromkeys(map(str, [*pattern.data_vars, *capture.data_vars])):
         drop = f"leave it out of all with drop=[{name!r}], in a command --drop {name}"
@@ -108,7 +108,7 @@ def _check_variables(label: str, capture: xr.Dataset, first: str, pattern: xr.Da
 
 
 def _check_labels(label: str, capture: xr.Dataset, first: str, pattern: xr.Dataset) -> None:
-    """Refuse other colors, and labels that cannot be those of both."""
+    """Refuse captures of different wavelengths, or with labels that conflict."""
     for name in dict.fromkeys(map(str, [*pattern.coords, *capture.coords])):
         own, other = (each.variables.get(name) for each in (capture, pattern))
         if own is None or other is None or not own.equals(other):
@@ -132,7 +132,7 @@ def _text(value: object) -> str:
 
 
 def _stacked(name: str, captures: list[xr.Dataset], dim: str) -> xr.Variable:
-    """One variable of all captures, in their order, each padded to the largest number of views."""
+    """Stack one variable of all captures in order, each padded to the largest number of views."""
     found = [capture[name].variable for capture in captures if name in capture]
     dims = [*next(captures[0][signal].dims for signal in SIGNALS if signal in captures[0])]
     if name not in FLAGS:
@@ -143,7 +143,7 @@ def _stacked(name: str, captures: list[xr.Dataset], dim: str) -> xr.Variable:
 
 
 def _padded(name: str, capture: xr.Dataset, dims: list[Hashable], views: int) -> np.ndarray:
-    """A variable of one capture, padded to a number of views."""
+    """Pad a variable of one capture to a number of views."""
     default = xr.Variable((), DEFAULTS.get(name, np.nan))
     variable = capture[name].variable if name in capture else default
     sizes = {each: capture.sizes[each] for each in dims}
@@ -157,6 +157,6 @@ def _padded(name: str, capture: xr.Dataset, dims: list[Hashable], views: int) ->
 
 
 def _common(attributes: Sequence[Mapping[Hashable, object]]) -> dict[Hashable, object]:
-    """The attributes that are equal in all."""
+    """Return the attributes that are equal in all captures."""
     first, *others = attributes or ({},)
     return {n: x for n, x in first.items() if all(n in each and each[n] == x for each in others)}

@@ -1,4 +1,4 @@
-"""Captures in netCDF files: read whole, written whole or not at all.
+"""Captures in netCDF files, which are verified when read and written atomically.
 
 The last line of a file is the SHA-256 digest of all bytes before it; HDF5 does not read so far. It
 is verified before a library reads the file, since HDF5 crashes or hangs on some damages.
@@ -24,7 +24,7 @@ MARK = b"\npolar_bayes sha256 "
 def read_netcdf[Data: (xr.Dataset, xr.DataTree)](
     kind: type[Data], file: Path, broken: PolarBayesError
 ) -> Data:
-    """Read a file whole, and verify its checksum where it has one."""
+    """Read a whole file, and verify its checksum where it has one."""
     try:
         is_whole = _is_whole(file)
     except OSError as error:
@@ -50,14 +50,14 @@ def write_netcdf(data: xr.Dataset | xr.DataTree, path: Path) -> None:
 
 
 def open_netcdf(kind: type, file: Path) -> Any:
-    """The data of a file, read when they are needed; a context that closes it."""
+    """Open a file lazily in a context that closes it."""
     open_file = xr.open_datatree if kind is xr.DataTree else xr.open_dataset
     # Absolute, so that netCDF takes no path for an address; times stay the numbers they are.
     return open_file(file.absolute(), engine="netcdf4", decode_times=False)
 
 
 def _is_whole(path: Path) -> bool:
-    """Whether the checksum of a file is right, or missing."""
+    """Return whether the checksum of a file is right, or missing."""
     size = path.stat().st_size
     with path.open("rb") as file:
         file.seek(max(0, size - 4096))  # more may have been appended to the last line
@@ -69,7 +69,7 @@ def _is_whole(path: Path) -> bool:
 
 
 def _digest(path: Path, size: int) -> str:
-    """SHA-256 of the first bytes of a file."""
+    """Return the SHA-256 digest of the first bytes of a file."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while size > 0 and (block := file.read(min(2**20, size))):
@@ -82,7 +82,7 @@ def _digest(path: Path, size: int) -> str:
 
 
 def load_capture(path: str | os.PathLike[str]) -> xr.Dataset:
-    """A capture from a netCDF file.
+    """Read a capture from a netCDF file.
 
     The file is read whole and closed. Where the capture has no attribute `name`, it is named after
     the file.
@@ -127,18 +127,18 @@ def save_capture(capture: xr.Dataset, path: str | os.PathLike[str]) -> None:
 
 
 def is_capture(file: Path) -> bool:
-    """Whether a file holds a capture; no value is read."""
+    """Return whether a file holds a capture; only its header is read."""
     return "view_zenith" in _header(file).variables
 
 
 def is_result(file: Path) -> bool:
-    """Whether a file holds a result that `save_result` wrote, of any kind; no value is read."""
+    """Return whether a file holds a result of any kind; only its header is read."""
     # Provenance, and that of a ledger of effects.
     return not {"polar_bayes", "chosen_scene"}.isdisjoint(_header(file).attrs)
 
 
 def _header(file: Path) -> xr.Dataset:
-    """Names and attributes of a netCDF file; empty for anything else."""
+    """Return names and attributes of a netCDF file; empty for any other file."""
     try:
         with open_netcdf(xr.Dataset, file) as opened:
             return opened

@@ -1,4 +1,4 @@
-"""What a capture says about itself, and readings that no light explains.
+"""Plausibility of a capture: readings that no light explains, and the index they suggest.
 
 A validated capture may still hold the channels swapped or the directions of another convention.
 Where unpolarized light falls in, a view at the mirror angle sees light of the surface, whose s
@@ -17,16 +17,16 @@ import numpy as np
 import xarray as xr
 
 SMALLEST_VIEWS = 3
-"""Views below which nothing is concluded from their polarization."""
+"""Smallest number of views from whose polarization anything is concluded."""
 PURE_PEAK = 0.9
-"""Polarization of a peak from which the surface alone makes it."""
+"""Degree of polarization from which a peak is attributed to the surface alone."""
 DEFAULT_INDICES = (1.2, 2.0)
-"""Smallest and largest index that the default priors allow; a test compares them."""
+"""Smallest and largest index under the default priors; a test compares them."""
 MAX_LISTED = 4
 
 
 class IndexByEye(NamedTuple):
-    """The index of a bare mirror whose Brewster's angle is where mirror views are polarized most.
+    """The index of a bare mirror, from the angle at which mirror views are most polarized.
 
     Args:
         low: Smallest index that the peak allows.
@@ -42,35 +42,35 @@ class IndexByEye(NamedTuple):
 
     @property
     def angle(self) -> float:
-        """The middle of the peak, unit degree."""
+        """The angle at the middle of the peak, unit degree."""
         return math.degrees(math.atan(self.center))
 
     @property
     def is_pure(self) -> bool:
-        """Whether the surface alone makes the peak."""
+        """True if the surface alone makes the peak."""
         return self.polarization >= PURE_PEAK
 
     @property
     def spread(self) -> float:
-        """Half the range, rounded up to one digit."""
+        """Half the width of the range of the index, rounded up to one digit."""
         half = 0.5 * (self.high - self.low)
         step = 10.0 ** math.floor(math.log10(half))
         return math.ceil(half / step - 1e-9) * step
 
     @property
     def prior(self) -> str:
-        """A prior that allows the range, as text."""
+        """A prior that includes the range, as text."""
         decimals = 1 if self.spread >= 0.1 else 2
         return f"TruncatedNormal({self.center:.{decimals}f}, {self.spread:g}, low=1)"
 
     def is_beyond(self, bounds: tuple[float, float]) -> bool:
-        """Whether a prior ends before the middle, and is not narrower than the range itself."""
+        """Return whether a prior ends before the middle and is not narrower than the range."""
         within = self.low <= bounds[0] and bounds[1] <= self.high
         within = within or self.high < 1.0  # no prior mends that
         return self.is_pure and not within and not bounds[0] <= self.center <= bounds[1]
 
     def is_excluded(self, bounds: tuple[float, float], degrees: float = 0.0) -> bool:
-        """Whether a prior ends before the range, also where all angles are off by so much."""
+        """Return whether a prior ends before the range, allowing for an angle offset."""
         low, high = (
             _index(math.degrees(math.atan(end)) + turn)
             for end, turn in ((self.low, -degrees), (self.high, degrees))
@@ -79,7 +79,7 @@ class IndexByEye(NamedTuple):
 
 
 def indices_by_eye(capture: xr.Dataset) -> dict[str, IndexByEye | None]:
-    """Brewster's angle by eye, as an index, for each material or patch of a capture.
+    """Estimate the index of each material or patch from Brewster's angle.
 
     The angles are those of mirror views, smoothed by a running median of three, so that a single
     reading makes no peak. The middle is that of the flanks.
@@ -100,7 +100,7 @@ def index_sentences(
     parameter: str = "refractive_index",
     prior: str = "the default prior",
 ) -> tuple[str, ...]:
-    """What Brewster's angle means where a prior excludes it, and the prior that allows it.
+    """State the index by Brewster's angle where a prior excludes it, and a prior that fits.
 
     Args:
         found: What `indices_by_eye` returned.
@@ -131,7 +131,7 @@ def index_sentences(
 
 
 def allowing_prior(found: Mapping[str, IndexByEye | None], bounds: tuple[float, float]) -> str:
-    """The text of a prior that allows the indices of all materials; "" where bounds do."""
+    """Return a prior, as text, that allows the indices of all materials; "" if bounds do."""
     pure = [each for each in found.values() if each and each.is_pure]
     if not any(each.is_beyond(bounds) for each in pure):
         return ""
@@ -142,7 +142,7 @@ def allowing_prior(found: Mapping[str, IndexByEye | None], bounds: tuple[float, 
 
 
 def cautions(capture: xr.Dataset) -> tuple[str, ...]:
-    """Readings or directions of a capture that are unlikely, each with its likely cause.
+    """List unlikely readings or directions of a capture, each with its likely cause.
 
     Args:
         capture: A validated capture.
@@ -157,7 +157,7 @@ def cautions(capture: xr.Dataset) -> tuple[str, ...]:
 
 
 def inferred(capture: xr.Dataset) -> tuple[str, ...]:
-    """What a capture holds and what its readings say at first sight, for its user to confirm.
+    """Describe a capture and what its readings suggest, for its user to confirm.
 
     Args:
         capture: A validated capture.
@@ -173,7 +173,7 @@ def inferred(capture: xr.Dataset) -> tuple[str, ...]:
 
 
 def stated(capture: xr.Dataset) -> tuple[str, ...]:
-    """What was done to the file of a capture, and what it states for its fits.
+    """Describe how the file of a capture was read, and what it states for fits.
 
     Args:
         capture: A validated capture.
@@ -204,7 +204,7 @@ def stated(capture: xr.Dataset) -> tuple[str, ...]:
 
 
 def _materials(capture: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
-    """The capture of each material or patch, with words that name it; an image is one."""
+    """Return the capture of each material or patch with its name; an image counts as one."""
     for dim in (name for name in ("material", "patch") if name in capture.dims):
         labels = capture[dim].values  # numbers from 0 where the capture has none
         return [(f" of {dim} {label}", capture.isel({dim: k})) for k, label in enumerate(labels)]
@@ -212,12 +212,12 @@ def _materials(capture: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
 
 
 def _azimuth_difference(capture: xr.Dataset) -> xr.DataArray:
-    """Angle between the azimuths of viewer and light, degree, 0 to 180."""
+    """Return the angle between azimuths of viewer and light, degree, 0 to 180."""
     return abs((capture["view_azimuth"] - capture["light_azimuth"] + 180.0) % 360.0 - 180.0)
 
 
 def _at_mirror(capture: xr.Dataset) -> xr.DataArray:
-    """Views at the mirror angle of the light."""
+    """Return True for views at the mirror angle of the light."""
     apart = abs(capture["view_zenith"] - capture["light_zenith"])
     return (apart <= 2.5) & (_azimuth_difference(capture) >= 175.0)
 
@@ -227,20 +227,20 @@ def _valid(capture: xr.Dataset) -> xr.DataArray:
 
 
 def _judged(capture: xr.Dataset, where: xr.DataArray, signal: str) -> xr.DataArray:
-    """Measured readings at those views, where the zenith lets surface and body be told apart."""
+    """Return True for measured readings at views whose zenith separates surface and body."""
     # Between these zeniths surface and body are polarized enough to be told apart.
     zenith, known = capture["view_zenith"], _valid(capture) & capture[signal].notnull()
     return where & (zenith >= 15.0) & (zenith <= 80.0) & known
 
 
 def _mostly(wrong: xr.DataArray, judged: xr.DataArray) -> str:
-    """How many of the judged views are wrong, such as "3 of 4"; empty where fewer than half."""
+    """Describe how many of the judged views are wrong, as "3 of 4"; empty if under half are."""
     count, total = int((judged & wrong).sum()), int(judged.sum())
     return f"{count} of {total}" if total >= SMALLEST_VIEWS and 2 * count >= total else ""
 
 
 def _noise(capture: xr.Dataset, signal: str) -> xr.DataArray:
-    """How far noise may carry a reading."""
+    """Return the largest plausible error of a reading by noise."""
     return 3.0 * capture.get(f"{signal}_error", xr.DataArray(0.03))
 
 
@@ -248,7 +248,7 @@ def _noise(capture: xr.Dataset, signal: str) -> xr.DataArray:
 
 
 def fresnel(zenith: Any, index: float) -> tuple[Any, Any]:
-    """Shares of s and p light that a smooth surface reflects at a zenith in degrees."""
+    """Return the s and p reflectance of a smooth surface at a zenith in degrees."""
     cos, sin = np.cos(np.deg2rad(zenith)), np.sin(np.deg2rad(zenith))
     inside = np.sqrt(index**2 - sin**2)
     s = ((cos - inside) / (cos + inside)) ** 2
@@ -257,7 +257,7 @@ def fresnel(zenith: Any, index: float) -> tuple[Any, Any]:
 
 
 def _body_polarization(zenith: xr.DataArray) -> xr.DataArray:
-    """Largest degree of polarization, along p, of light that leaves a body at a zenith."""
+    """Return the largest DoP, along p, of light that leaves a body at a zenith."""
     s, p = fresnel(zenith, 2.5)
     return (s - p) / (2.0 - s - p)
 
@@ -276,7 +276,7 @@ def _azimuth_cautions(capture: xr.Dataset) -> Iterator[str]:
 
 
 def _excess_cautions(capture: xr.Dataset) -> Iterator[str]:
-    """Readings of q and u together beyond 1 by more than their errors allow."""
+    """Caution against (q, u) longer than 1 by more than the errors allow."""
     if "q_error" not in capture or "u_error" not in capture:
         return
     q, u = capture["q"], capture["u"]
@@ -296,7 +296,7 @@ def _excess_cautions(capture: xr.Dataset) -> Iterator[str]:
 
 
 def _gamma_cautions(capture: xr.Dataset) -> Iterator[str]:
-    """Counts that four analyzer angles or more contradict to be in proportion to light."""
+    """Caution against counts that are not in proportion to light by their analyzer angles."""
     undone, gamma, error = (
         float(capture.attrs.get(name, 1.0))
         for name in ("transfer_gamma", "measured_gamma", "measured_gamma_error")
@@ -315,7 +315,7 @@ def _gamma_cautions(capture: xr.Dataset) -> Iterator[str]:
 
 
 def _sign_cautions(name: str, capture: xr.Dataset) -> Iterator[str]:
-    """Views at the mirror angle with more p light than the body alone can send."""
+    """Caution against mirror views with more p light than the body alone can send."""
     if "q" not in capture:
         return
     judged = _judged(capture, _at_mirror(capture), "q")
@@ -330,7 +330,7 @@ def _sign_cautions(name: str, capture: xr.Dataset) -> Iterator[str]:
 
 
 def _side_cautions(name: str, capture: xr.Dataset) -> Iterator[str]:
-    """Views on the light's own side that are polarized as only a mirror angle can be."""
+    """Caution against views on the light's side that are polarized like mirror views."""
     signal = next((each for each in ("dop", "q") if each in capture), None)
     if signal is None or capture.attrs.get("setup") == "picture":  # light from everywhere
         return
@@ -351,7 +351,7 @@ def _side_cautions(name: str, capture: xr.Dataset) -> Iterator[str]:
 
 
 def _scale_cautions(name: str, capture: xr.Dataset) -> Iterator[str]:
-    """A Brewster angle below that of vacuum, as if angles counted from the surface."""
+    """Caution against a Brewster angle below that of vacuum: angles from the surface?"""
     peak = _brewster(capture)
     if peak is not None and peak.high < 1.0:
         yield (
@@ -407,7 +407,7 @@ def _brewster_sentences(name: str, capture: xr.Dataset) -> Iterator[str]:
 
 
 def _brewster(capture: xr.Dataset) -> IndexByEye | None:
-    """The index that the largest polarization of mirror views means, where they show a peak."""
+    """Return the index from the peak of polarization of mirror views, where they show one."""
     signal = next((each for each in ("q", "dop") if each in capture), None)
     if signal is None or {"y", "x"} & set(capture.dims):
         return None
@@ -427,7 +427,7 @@ def _brewster(capture: xr.Dataset) -> IndexByEye | None:
 
 
 def _peak(angles: np.ndarray, values: np.ndarray, noise: float) -> IndexByEye | None:
-    """The index that the middle of the flanks means, of values over angles in degrees."""
+    """Return the index from the middle between both flanks of a peak; angles in degrees."""
     # A single reading far from its neighbors, which is no peak, does not pass a running median. It
     # moves a flank by one step at most.
     smooth = values.copy()
@@ -451,12 +451,12 @@ def _peak(angles: np.ndarray, values: np.ndarray, noise: float) -> IndexByEye | 
 
 
 def _index(angle: float) -> float:
-    """The index that an angle in degrees, as Brewster's, means."""
+    """Return the index whose Brewster angle this is, in degrees."""
     return math.tan(math.radians(min(max(angle, 0.0), 89.0)))
 
 
 def _middle(rises: float, falls: float) -> float:
-    """Brewster's angle of the mirror that polarizes alike at two angles, all in degrees."""
+    """Return Brewster's angle of the mirror that polarizes equally at two angles, in degrees."""
     # Both reflect the same |cos(z + t) / cos(z - t)|, with t the angle of refraction: the product
     # of tan(z) tan(t) is 1, and Snell's law makes that a quadratic equation for n^2.
     a, b = np.sin(np.deg2rad([rises, falls])) ** 2

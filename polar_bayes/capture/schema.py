@@ -35,7 +35,8 @@ SPELLINGS = {
 }
 
 SMALLEST_SCAN, LARGEST_SCAN_END = 0.1, 0.2
-"""Span and largest zenith below which a scan in radians would be one of a few degrees."""
+"""Smallest span and largest end of a scan whose zeniths, in radians, would be mistaken for a few
+degrees."""
 
 # q and u are measured one by one, so their noise may carry q^2 + u^2 a little past one.
 EXCESS_POLARIZATION = 0.05
@@ -43,7 +44,7 @@ EXCESS_POLARIZATION = 0.05
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """The numbers that a variable may take; an open end is not itself allowed."""
+    """A range of allowed numbers; an open end is itself excluded."""
 
     low: float
     high: float
@@ -51,19 +52,19 @@ class Interval:
     open_high: bool = False
 
     def contains(self, values: Any) -> Any:
-        """True where a number, or each of an array, lies inside; NaN never does."""
+        """Return True for numbers inside, False for others and NaN; any shape."""
         above = values > self.low if self.open_low else values >= self.low
         below = values < self.high if self.open_high else values <= self.high
         return above & below
 
     def check(self, value: object, where: str) -> float:
-        """A number given by the user, refused unless it lies inside."""
+        """Return a number given by the user, or refuse it if it lies outside."""
         if isinstance(value, Real) and not isinstance(value, bool) and self.contains(value):
             return float(value)
         raise CaptureError(f"it is {value!r}", where=where, hint=f"give {self}")
 
     def check_fields(self, owner: object, *names: str) -> None:
-        """Refuse fields of an object that are no numbers inside."""
+        """Refuse an object with a field that is not a number inside."""
         for name in names:
             self.check(getattr(owner, name), f"{type(owner).__name__}: {name}")
 
@@ -75,7 +76,7 @@ class Interval:
 
 @dataclasses.dataclass(frozen=True)
 class Variable:
-    """One row of the contract."""
+    """One variable of a capture: its dims, unit and range."""
 
     name: str
     kind: Literal["geometry", "trust", "reading", "flag", "label"]
@@ -99,7 +100,7 @@ FRACTION = f"give a fraction, not percent; {MASK}"
 
 
 def _direction(name: str) -> tuple[Variable, Variable]:
-    """Zenith and azimuth of viewer or light."""
+    """Return the variable of a zenith or azimuth of viewer or light."""
     hint, turns = "give degrees from the surface normal", Interval(-360.0, 360.0)
     zenith, azimuth = f"{name} zenith angle", f"{name} azimuth"
     return (
@@ -111,7 +112,7 @@ def _direction(name: str) -> tuple[Variable, Variable]:
 
 
 def _error(name: str, units: str | None) -> Variable:
-    """The error of a reading."""
+    """Return the variable of the standard error of a reading."""
     meaning, hint = f"standard deviation of {name}", f"give a standard deviation above zero; {MASK}"
     return Variable(f"{name}_error", "reading", units, ERROR, meaning, hint, name)
 
@@ -156,7 +157,7 @@ WAVELENGTH = Variable(
 
 
 def as_numbers(values: object) -> np.ndarray:
-    """An array of float64; a single NaN in place of what is no array of numbers."""
+    """Convert to an array of float64; return a single NaN for anything that is not numbers."""
     try:
         return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
@@ -172,7 +173,7 @@ def check_choice(value: object, among: Iterable[str | None], where: str) -> None
 
 
 def nearest_name(name: object, known: Sequence[str]) -> str | None:
-    """The known name most similar to this one; None where it is known, or names a truth."""
+    """Return the most similar known name; None if the name is known or names a truth."""
     if name in known or (isinstance(name, str) and TRUTH.fullmatch(name)):
         return None
     return difflib.get_close_matches(str(name), known, n=1, cutoff=0.0)[0]
@@ -187,11 +188,11 @@ class Layout:
 
     @property
     def readings(self) -> tuple[str, ...]:
-        """Dims of readings, their errors and flags."""
+        """Dims of readings, of their errors and of their flags."""
         return (*self.leading, "view", *(("wavelength",) if self.spectral else ()))
 
     def allowed(self, row: Variable) -> tuple[tuple[str, ...], ...]:
-        """The dims, in canonical order, that a variable of the contract may have."""
+        """Return the dims that a variable may have, in canonical order."""
         if row.kind == "geometry":
             return tuple(dict.fromkeys([("view",), (*self.leading, "view")]))
         if row.kind == "trust":
@@ -205,7 +206,7 @@ class Layout:
 
 
 def clean_attributes(attributes: Mapping[Any, object], where: str) -> dict[str, str | int | float]:
-    """Attributes as plain text and numbers, so that a file gives back what was saved."""
+    """Convert attributes to plain text and numbers, which files return unchanged."""
     # xarray gives these a meaning of its own when it writes netCDF.
     reserved = {"add_offset", "coordinates", "dtype", "missing_value", "scale_factor"}
     allowed = re.compile(r"[A-Za-z][A-Za-z0-9_.+-]{0,99}")
@@ -245,7 +246,7 @@ def _clean_value(value: object, where: str) -> str | int | float:
 
 
 def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
-    """The capture, checked against the contract and written in one canonical form.
+    """Check a capture against the contract and return it in canonical form.
 
     Canonical: float64 numbers, boolean flags, dims in the order (leading..., view[, wavelength]),
     `units` and `long_name` of the contract, attributes of text and numbers only. No number is
@@ -294,7 +295,7 @@ def validate(dataset: xr.Dataset, *, source: str = "capture") -> xr.Dataset:
 
 
 def count(capture: xr.Dataset) -> dict[str, int]:
-    """How many entries a capture holds: every view of every patch or pixel and wavelength.
+    """Count the entries of a capture, those that are masked, and those that are saturated.
 
     Args:
         capture: A validated capture.
@@ -348,7 +349,7 @@ def _layout(dataset: xr.Dataset, source: str) -> Layout:
 
 
 def _ordered(variable: xr.Variable, row: Variable, layout: Layout, source: str) -> xr.Variable:
-    """The variable with its dims in canonical order."""
+    """Transpose a variable to the canonical order of dims."""
     options = layout.allowed(row)
     for dims in options:
         if _same_dims(variable.dims, dims):
@@ -363,14 +364,14 @@ def _same_dims(dims: Sequence[Hashable], wanted: Sequence[str]) -> bool:
 
 
 def dims_text(dims: Iterable[Hashable]) -> str:
-    """The dims as `(view, wavelength)`."""
+    """Format dims as `(view, wavelength)`."""
     return f"({', '.join(map(str, dims))})"
 
 
 def _entries(
     dataset: xr.Dataset, row: Variable, layout: Layout, source: str, valid: np.ndarray | bool = True
 ) -> xr.Variable:
-    """A variable of the contract in canonical form; readings that are not valid are not checked."""
+    """Return a variable in canonical form; only valid readings are checked."""
     variable = _ordered(dataset[row.name].variable, row, layout, source)
     values, is_flag = variable.values, row.kind == "flag"
     if not is_flag or values.dtype.kind != "b":  # netCDF has no truth values, only 0 and 1
@@ -388,7 +389,7 @@ def _entries(
 
 
 def hint_for(row: Variable, wrong: np.ndarray) -> str:
-    """What to do about numbers outside their range, by their likely cause."""
+    """Suggest a remedy for numbers outside their range, by their likely cause."""
     if row.name in SIGNALS and np.isnan(wrong).any():
         return f"{MASK}, as by capture['valid'] = capture[{row.name!r}].notnull()"
     is_polarization = row.kind == "reading" and row.hint == FRACTION
@@ -399,7 +400,7 @@ def hint_for(row: Variable, wrong: np.ndarray) -> str:
 
 
 def _check_degrees(numbers: Mapping[str, xr.Variable], source: str) -> None:
-    """Refuse zeniths that look like radians: a scan of views, and no angle above pi/2."""
+    """Refuse zeniths that look like radians: a scan of views with no angle above pi/2."""
     zeniths = {name: numbers[name] for name in ("view_zenith", "light_zenith")}
     if any(zenith.values.max() > np.pi / 2.0 for zenith in zeniths.values()):
         return
@@ -456,7 +457,7 @@ def _floats(values: np.ndarray, where: str) -> np.ndarray:
 
 
 def _labels(dataset: xr.Dataset, layout: Layout, source: str) -> dict[str, xr.Variable]:
-    """Coordinates named after a dim, along it or as the one label that selection leaves."""
+    """Return coordinates that label a dim, or hold the single label that a selection left."""
     labels = {}
     for name in (name for name in LABELS if name in dataset.variables):
         row = Variable(name, "label", None, UNIT, name, "")
@@ -507,7 +508,7 @@ def _saturation_level(level: str | int | float, where: str) -> float:
 
 
 def _check_intensity_units(numbers: dict[str, xr.Variable], source: str) -> None:
-    """An error without units has those of the intensity; others must agree."""
+    """Give an error without units those of the intensity; refuse other units."""
     if "intensity_error" not in numbers:
         return
     intensity, error = numbers["intensity"].attrs, numbers["intensity_error"].attrs
@@ -520,7 +521,7 @@ def _check_intensity_units(numbers: dict[str, xr.Variable], source: str) -> None
 
 
 def _entry(name: str, dims: Sequence[Hashable], index: Sequence[int | np.intp]) -> str:
-    """An entry of a variable, such as `dop[patch=2, view=3]`."""
+    """Name an entry of a variable, such as `dop[patch=2, view=3]`."""
     if not dims:
         return name
     positions = (f"{dim}={int(position)}" for dim, position in zip(dims, index, strict=True))

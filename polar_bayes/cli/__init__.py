@@ -1,4 +1,4 @@
-"""The command line: thin; it parses, calls the Python interface and prints."""
+"""The command line: it parses arguments, calls the Python interface and prints."""
 
 from polar_bayes.cli.entry import commands, console, main
 

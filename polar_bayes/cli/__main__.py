@@ -1,4 +1,4 @@
-"""`python -m polar_bayes.cli` is `polar-bayes`."""
+"""Entry point of `python -m polar_bayes.cli`, which is the program `polar-bayes`."""
 
 from polar_bayes.cli.entry import console
 

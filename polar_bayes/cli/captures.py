@@ -36,7 +36,7 @@ wavelength_option = option("--wavelength", type=float, help="Nanometers.")
 
 
 def _save(capture: "Capture", out: Path) -> None:
-    """Write a capture, and print its counts."""
+    """Write a capture, and print how many entries it has."""
     pb.save_capture(capture, out)
     counts = pb.capture.count(capture)
     flagged = (f"{counts[what]} {what}" for what in ("masked", "saturated"))
@@ -44,7 +44,7 @@ def _save(capture: "Capture", out: Path) -> None:
 
 
 def _layout(capture: "Capture") -> str:
-    """Lengths of the axes of a capture: `12 views x 4 wavelengths`."""
+    """Format the lengths of the axes of a capture: `12 views x 4 wavelengths`."""
     plural = {"view": "s", "wavelength": "s", "material": "s", "patch": "es"}
     sizes = {dim: capture.sizes[dim] for dim in plural if dim in capture.sizes}
     found = [f"{size} {dim}{'' if size == 1 else plural[dim]}" for dim, size in sizes.items()]
@@ -104,7 +104,7 @@ def combine(captures: tuple[Path, ...], dim: str, drop: tuple[str, ...], out: Pa
 
 
 def _numbered(names: list[str]) -> list[str]:
-    """The names, each only once: those that are equal with numbers behind them."""
+    """Make names unique by numbers behind those that occur more than once."""
     labels: list[str] = []
     for name in names:
         numbered = (f"{name} {number}" for number in itertools.count(1))
@@ -206,7 +206,7 @@ def ellipsometer(table: Path, out: Path, wavelength: tuple[str, ...], **settings
 
 
 def _number_or_column(text: str | None) -> float | str | None:
-    """A number, or the name of a column."""
+    """Parse a number, or else return the text as the name of a column."""
     try:
         return None if text is None else float(text)
     except ValueError:
@@ -251,7 +251,7 @@ def table(
 
 
 def _mapping[T](pairs: tuple[tuple[str, T], ...], flag: str) -> dict[str, T]:
-    """A mapping from an option that is given once for each variable."""
+    """Return a mapping from an option that is given once for each variable."""
     names = [name for name, _ in pairs]
     if repeated := [name for name in names if names.count(name) > 1]:
         raise click.UsageError(f"{flag} names {repeated[0]} twice")
@@ -298,7 +298,7 @@ image_options = all_of(
     name_option,
     out_capture,
 )  # fmt: skip
-"""The options that every import of camera frames has."""
+"""Options of every import of camera frames."""
 
 
 @import_.command(cls=Command)
@@ -346,7 +346,7 @@ def _save_image(capture: "Capture", out: Path) -> None:
 
 
 def _image_arguments(options: dict[str, Any]) -> dict[str, Any]:
-    """Arguments of an import from the options of a command."""
+    """Return the arguments of an import from the options of a command."""
     pop = options.pop
     dark, dark_level = pop("dark"), pop("dark_level")
     if dark is not None and dark_level is not None:
@@ -375,7 +375,7 @@ def _image_arguments(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _only_one[T](given: dict[str, T]) -> T:
-    """The value of the one option that was given."""
+    """Return the value of the one option that was given."""
     values = [value for value in given.values() if value]
     if len(values) != 1:
         raise click.UsageError(f"give one of {', '.join(given)}")

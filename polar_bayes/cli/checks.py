@@ -124,7 +124,7 @@ def identify(
     as_json: bool,
     **settings: Any,
 ) -> None:
-    """Which parameters a capture determines, which trade off, and where to look next."""
+    """Show which parameters a capture determines, which trade off, and where to look next."""
     data, settings = pb.load_capture(capture), read_scene_options(settings)
     with stages() as progress:
         settings["progress"] = progress
@@ -153,7 +153,7 @@ def identify(
 @known_option
 @json_option
 def budget(fit: Path, known: dict[str, float], as_json: bool) -> None:
-    """How much of each uncertainty comes from noise, from the prior and from the set-up."""
+    """Show how much of each uncertainty comes from noise, from the prior and from the set-up."""
     table = pb.budget(pb.load(fit, "fit"), known=known)
     if as_json:
         print_json({"known": table.attrs["known"], "parameters": json_rows(table)})
@@ -184,7 +184,7 @@ def accuracy(
     as_json: bool,
     **settings: Any,
 ) -> None:
-    """What each method gets wrong for this capture, and what it costs in time."""
+    """Compare the errors and run times of all methods for this capture."""
     data, settings = pb.load_capture(capture), read_scene_options(settings)
     names = methods or tuple(pb.methods.STUDY_METHODS)
     shown = ["error", "worst", "pareto_k", "r_hat", "seconds_first", "seconds_again"]
@@ -202,7 +202,7 @@ def accuracy(
         settings["overrides"] = ()
 
     def keep(study: "Result") -> None:
-        """Write the study so far, and tell its last row."""
+        """Write the study so far, and print its last row."""
         pb.save(study, out)
         name, row = list(pb.summary(study).iterrows())[-1]
         told = f"off by {row['error']:.2g} sd ({row['worst']}), {row['seconds_first']:.0f} s"

@@ -50,13 +50,14 @@ SIGNALS = tuple(
 )
 
 POLL, CLEAN_UP, LEAVE = 0.1, 3.0, 0.5
-"""Seconds: between two polls for a signal; for all cleanups; for threads that are still alive."""
+"""Seconds between polls for a signal; seconds allowed for all cleanups, and for threads that are
+still alive."""
 
 FOLDER = "JAX_COMPILATION_CACHE_DIR"
 
 
 def run_until_signal(command: Callable[[], int]) -> int:
-    """Run a command in a thread of its own; a signal ends the process."""
+    """Run a command in its own thread; a signal ends the process."""
     # The first signal runs the cleanups and prints one line; the second ends the process at once.
     # Signals that the process was started to ignore (`nohup`) stay ignored.
     received: list[int] = []
@@ -99,7 +100,7 @@ def _start(context: contextvars.Context, command: Callable[[], int], outcome: Fu
 
 
 def _stop(number: int) -> NoReturn:
-    """Clean up and end the process; the main thread can receive the next signal meanwhile."""
+    """Clean up and end the process; meanwhile the main thread can receive the next signal."""
 
     def work() -> None:
         text = ". ".join(["polar-bayes: stopped", *clean_up()])
@@ -114,7 +115,7 @@ def _stop(number: int) -> NoReturn:
 
 
 def end(status: int) -> NoReturn:
-    """End the process, without waiting for threads that compute what nobody needs any more."""
+    """End the process without waiting for threads whose results are no longer needed."""
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, signal.SIG_DFL)  # no traceback from here on
@@ -123,7 +124,7 @@ def end(status: int) -> NoReturn:
 
 
 def _leave(status: int) -> None:
-    """End the process if threads keep it from ending: Python joins those that are no daemons."""
+    """End the process if threads keep it alive: Python joins threads that are not daemons."""
     time.sleep(LEAVE)
     main = threading.main_thread()
     if any(not each.daemon for each in threading.enumerate() if each is not main):
@@ -175,7 +176,7 @@ def keep_compiled_programs() -> None:
 
 
 def limit_arenas() -> None:
-    """Have threads share two pools of memory, so that a map takes as much whatever its size."""
+    """Make threads share two malloc arenas, so that the memory of a map does not grow with size."""
     with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library
         ctypes.CDLL(None).mallopt(-8, 2)  # M_ARENA_MAX of the C library of GNU
 
@@ -200,7 +201,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _own_process() -> int:
-    """The command of the process itself; its output is flushed while an error still has a line."""
+    """Run the command of the process itself, and flush its output before errors are printed."""
     limit_arenas()
     quiet_libraries()
     keep_compiled_programs()
@@ -216,7 +217,7 @@ def _own_process() -> int:
 
 
 def _run(arguments: list[str] | None) -> int:
-    """Run one command; whatever goes wrong is one line."""
+    """Run one command, and print any error on one line."""
     output = sys.stdout
     try:
         status = commands.main(arguments, prog_name="polar-bayes", standalone_mode=False)
@@ -242,7 +243,7 @@ def _run(arguments: list[str] | None) -> int:
 
 
 def _last_resort(error: Exception) -> int:
-    """One line for an error that no command expects, and the exit status."""
+    """Print an unexpected error on one line, and return the exit status."""
     if os.environ.get(TRACEBACK):
         traceback.print_exception(error)
     said = next(iter(str(error).strip().splitlines()), "")[:200]  # the hint must fit beside it
@@ -263,7 +264,7 @@ def _last_resort(error: Exception) -> int:
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="polar_bayes")
 def commands() -> None:
-    """From polarization captures to calibrated posteriors of layered dielectrics."""
+    """Turn polarization captures into calibrated posteriors of layered dielectrics."""
 
 
 for _command in (*CAPTURE_COMMANDS, *FIT_COMMANDS, *CHECK_COMMANDS):

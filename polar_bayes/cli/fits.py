@@ -55,14 +55,14 @@ if TYPE_CHECKING:
     from polar_bayes.results import Result
 
 DEMO = "polar-bayes demo"
-"""Attribute of the capture of a demo, by which the next demo recognizes its folder."""
+"""Attribute that marks the capture of a demo, so that the next demo recognizes its folder."""
 
 
 @command()
 @out_option(FOLDER, "Folder to write.", required=False, default=Path("polar-bayes-demo"))
 @seed_option
 def demo(out: Path, seed: int) -> int:
-    """Capture, fit, diagnostics and report of an embedded example."""
+    """Run an embedded example: capture, fit, diagnostics and report."""
     _make_folder(out)
     capture = pb.simulate("plastic", seed=seed).assign_attrs(made_by=DEMO)
     pb.save_capture(capture, out / "capture.nc")
@@ -79,7 +79,7 @@ def demo(out: Path, seed: int) -> int:
 
 
 def _make_folder(folder: Path) -> None:
-    """The folder of a demo: new, empty, or that of an earlier demo."""
+    """Create the folder of a demo; refuse one that holds anything but an earlier demo."""
     with write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         names = {path.name for path in folder.iterdir()}
@@ -161,13 +161,13 @@ def fit(
 
 
 def _kept(fit: Any, out: Path) -> str:
-    """Write a fit that is not compared to the end; the sentence that says so."""
+    """Write a fit whose comparisons were not finished, and return a sentence that says so."""
     pb.save(fit, out)
     return f"{out}: the fit is whole, and was not compared with other scenes to the end"
 
 
 def _in_setup(chosen: Any, scene: Any) -> Any:
-    """The chosen scene with the links and limits of the set-up from which it was chosen."""
+    """Return the chosen scene with links and limits of the set-up from which it was chosen."""
     if scene is None or isinstance(scene, pb.Scene):
         return chosen
     return dataclasses.replace(pb.setups.find_setup(scene), scene=chosen)
@@ -231,7 +231,7 @@ def map_(
 @option("--against", type=int, help="Region from which the others are subtracted.")
 @json_option
 def regions(maps: Path, labels: Path, against: int | None, as_json: bool) -> None:
-    """Means of a map over the regions of a label image, and how they differ."""
+    """Compute means of a map over the regions of a label image, and their differences."""
     picture = pb.maps.load_labels(labels)
     found = pb.maps.region_means(pb.maps.open_map(maps), picture, against=against)
     table, cautions = pb.maps.region_table(found), found.attrs["cautions"]
@@ -246,13 +246,13 @@ def regions(maps: Path, labels: Path, against: int | None, as_json: bool) -> Non
 @capture_argument
 @scene_options
 @option("--tolerance", type=float, default=0.1, help="Posterior sd.")
-@option("--keep", multiple=True, help="Effect that stays; give it once per effect.")
-@option("--drop", multiple=True, help="Effect that goes; give it once per effect.")
+@option("--keep", multiple=True, help="Effect to keep; give it once per effect.")
+@option("--drop", multiple=True, help="Effect to drop; give it once per effect.")
 @seed_option
 @json_option
 @out_option(RESULT_FILE, "Ledger to write.", required=False)
 def effects(capture: Path, as_json: bool, out: Path | None, **settings: Any) -> None:
-    """What each effect changes and costs; which of them this capture can see."""
+    """Show what each effect changes and costs, and which effects this capture can see."""
     data, settings = pb.load_capture(capture), read_scene_options(settings)
     with stages() as progress:
         ledger: Any = pb.choose_effects(data, progress=progress, **settings).ledger
@@ -358,12 +358,12 @@ def report(
 
 
 def _is_new_fit(result: "Result") -> bool:
-    """Whether it is a fit of which nobody has asked yet what to measure next."""
+    """Return whether a result is a fit that holds no next views yet."""
     return "posterior" in result and "next_views" not in result and pb.verdict(result).passed
 
 
 def _add_next_views(result: "Result", progress: Progress) -> None:
-    """Keep with a fit which views to take next; where that is not known, say why."""
+    """Add to a fit which views to take next, or why that is not known."""
     progress("looking for the next views", 0.0)
     try:
         result["next_views"] = pb.next_views(result, progress=progress)
@@ -390,7 +390,7 @@ def compare(fits: tuple[Path, ...], out: Path) -> int:
 
 
 def _load_all(paths: tuple[Path, ...], kind: str) -> dict[str, Any]:
-    """Results of one kind by the names of their files."""
+    """Load results of one kind by the names of their files."""
     if len({path.stem for path in paths}) < len(paths):
         raise click.UsageError("two of the files have the same name")
     return {path.stem: pb.load(path, kind) for path in paths}

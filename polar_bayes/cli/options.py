@@ -22,7 +22,7 @@ type Context = click.Context | None
 
 
 def _flag(param: Param) -> str:
-    """An option or argument as errors name it."""
+    """Format an option or argument as errors name it."""
     return param.opts[0] if param is not None else "value"
 
 
@@ -50,7 +50,7 @@ class Name(click.ParamType):
 
 @dataclasses.dataclass(frozen=True)
 class Assignment(click.ParamType):
-    """NAME=CALL, such as `angle_zero=Normal(0,3)`; the name may be left out where one is enough."""
+    """Option type: NAME=CALL, such as `angle_zero=Normal(0,3)`; some options make NAME optional."""
 
     is_named: bool
     is_number: bool = False
@@ -106,7 +106,7 @@ class Input(click.ParamType):
         raise SceneError("no such scene", where=f"{_flag(param)} {value}", hint=hint)
 
     def check(self, path: Path) -> None:
-        """Refuse a path that does not exist, unless it may be the name of a column."""
+        """Refuse a path that does not exist, unless it can be the name of a column."""
         if self.is_path and not path.exists():
             what = "store" if path.suffix == ".zarr" else "file"
             raise CaptureError(f"there is no such {what}", where=str(path), hint="check the path")
@@ -114,7 +114,7 @@ class Input(click.ParamType):
 
 @dataclasses.dataclass(frozen=True)
 class Output(click.ParamType):
-    """Path of an output; it is checked when all inputs are known."""
+    """Option type: path of an output, which is checked when all inputs are known."""
 
     # A folder or store has no `kind`; the function that writes it checks the rest.
 
@@ -175,7 +175,7 @@ def _paths(value: object, kind: Input) -> Iterator[Path]:
 
 command = functools.partial(click.command, cls=Command)
 option = functools.partial(click.option, show_default=True)
-"""An option that states its default, where it has one."""
+"""Declare an option whose help states its default, if it has one."""
 
 capture_argument = click.argument("capture", type=INPUT)
 model_option = option("--model", type=MODEL, default="per_material")
@@ -202,14 +202,14 @@ view_limit_option = option(
 
 
 def all_of(*options: Callable) -> Callable:
-    """Several options as one decorator."""
+    """Combine several options into one decorator."""
     return lambda function: functools.reduce(
         lambda inner, each: each(inner), options[::-1], function
     )
 
 
 scene_options = all_of(scene_option, prior_option, link_option, view_limit_option)
-"""The options of every command that fits a scene."""
+"""Options of every command that fits a scene."""
 
 
 NUTS_OPTIONS = {
@@ -226,7 +226,7 @@ nuts_options = all_of(*NUTS_OPTIONS.values())
 
 
 def with_nuts_options(settings: dict[str, Any]) -> dict[str, Any]:
-    """The settings of a fit, with those of its sampler in the method."""
+    """Return the settings of a fit with those of its sampler inside the method."""
     given = {name: settings.pop(name) for name in NUTS_OPTIONS}
     given = {name: value for name, value in given.items() if value is not None}
     if given:
@@ -246,7 +246,7 @@ json_option = option("--json", "as_json", is_flag=True, help="Print the tables a
 
 
 def out_option(kind: Output, help_text: str, **settings: Any) -> Any:
-    """The option --out, required unless it has a default."""
+    """Declare the option --out, required unless it has a default."""
     return option("--out", type=kind, help=help_text, **{"required": True, **settings})
 
 
@@ -254,7 +254,7 @@ def out_option(kind: Output, help_text: str, **settings: Any) -> Any:
 
 
 def read_scene_options(settings: dict[str, Any]) -> dict[str, Any]:
-    """The options of a command, with what they and a scene file state as values.
+    """Return the options of a command, with texts and scene files replaced by values.
 
     What is given on the command line counts more than what the file says.
     """

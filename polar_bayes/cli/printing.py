@@ -1,4 +1,4 @@
-"""What commands print: sentences in their own words, tables, JSON, and the verdict of a fit."""
+"""Output of commands: sentences in their vocabulary, tables, JSON, and the verdict of a fit."""
 
 import json
 import sys
@@ -20,12 +20,12 @@ NOT_CONVERGED = 2
 
 
 def say(sentence: object, *, err: bool = False) -> None:
-    """Print a sentence of the package, or an error, in the words of the command line."""
+    """Print a sentence or an error of the package, with functions replaced by commands."""
     click.echo(as_commands(str(sentence)), err=err)
 
 
 def print_json(value: object) -> None:
-    """Print a value as strict JSON, its sentences in the words of the command line."""
+    """Print a value as strict JSON; its sentences name commands and options."""
     click.echo(json.dumps(_in_commands(value), indent=2, allow_nan=False))
 
 
@@ -38,12 +38,12 @@ def _in_commands(value: object) -> object:
 
 
 def json_rows(table: "Frame", orient: Literal["index", "records"] = "index") -> object:
-    """The rows of a data frame by label, or in a list (`"records"`), as JSON has them."""
+    """Return the rows of a data frame by label, or as a list (`"records"`), for JSON."""
     return json.loads(table.to_json(orient=orient))
 
 
 def print_frame(frame: "Frame", sentences: Iterable[str] = ()) -> None:
-    """Print a data frame, numbers with four digits and missing ones as -, and sentences below."""
+    """Print a data frame with four digits and - for missing numbers, and sentences below."""
     rows = (Row(str(label), tuple(map(_text, cells))) for label, *cells in frame.itertuples())
     click.echo(Table(("", *frame.columns), tuple(rows)).to_text(sys.stdout))
     if sentences:
@@ -62,7 +62,7 @@ def _text(cell: object) -> str:
 
 
 def print_verdict(result: "Result") -> int:
-    """Print what speaks against a fit, or what was checked, on the error stream; exit status."""
+    """Print problems and cautions, or the checks made, on stderr; return the exit status."""
     verdict = pb.verdict(result)
     for problem in verdict.problems:
         say(f"problem: {problem}", err=True)
@@ -75,7 +75,7 @@ def print_verdict(result: "Result") -> int:
 
 
 def print_fit(result: "Fit", *, as_json: bool = False) -> int:
-    """Print a row per parameter, and the verdict as `print_verdict` does."""
+    """Print a row per parameter and the verdict; return the exit status."""
     if as_json:
         print_json(pb.diagnostics.json_summary(result))
     else:
@@ -88,7 +88,7 @@ def print_fit(result: "Fit", *, as_json: bool = False) -> int:
 
 
 def _explanations(result: "Fit") -> Iterator[str]:
-    """What parameters mean whose names do not say it, with their units."""
+    """Explain parameters whose names are not clear alone, with their units."""
     for name, variable in result["posterior"].data_vars.items():
         meaning, unit = (variable.attrs.get(key, "") for key in ("long_name", "units"))
         if meaning and not meaning.startswith(str(name).replace("_", " ")):

@@ -1,4 +1,4 @@
-r"""Advice in the words of the command line.
+r"""Translation of advice from Python calls to commands and options.
 
 Sentences and hints are written once, in their Python form. Whatever a command prints of them passes
 through `as_commands`, which puts an option or a command in the place of each keyword, setting or
@@ -27,7 +27,7 @@ FUNCTIONS = {
     "profile": "identify",
     "region_means": "regions",
 }
-"""Functions, and the command that calls each."""
+"""Functions, and the command that calls each of them."""
 
 KEYWORDS = {
     **{
@@ -45,7 +45,7 @@ KEYWORDS = {
     "shared": "--share",
     "store": "--out",
 }
-"""Keyword arguments, and the option that stands for each."""
+"""Keyword arguments, and the option that sets each of them."""
 
 CALL = r"\((?:[^()']|'[^']*'|\([^()]*\))*\)"
 FREE = r"(?<![\w.('=])"  # not within quotes, brackets or another name
@@ -95,31 +95,31 @@ RULES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (rf"{PACKAGE}({FUNCTION})\b", lambda found: f"polar-bayes {FUNCTIONS[found[1]]}"),
     (rf"^({FUNCTION}):", lambda found: f"{FUNCTIONS[found[1]]}:"),
 )  # fmt: skip
-"""What is replaced by what, from the first to the last."""
+"""Patterns and their replacements, applied in this order."""
 
 
 def as_commands(text: str) -> str:
-    """A sentence or error that names options and commands in place of Python."""
+    """Translate a sentence or error so that it names options and commands, not Python."""
     for pattern, replacement in RULES:
         text = re.sub(pattern, replacement, text)
     return text
 
 
 def _capture() -> str:
-    """The capture that the command is about, so that its advice can be typed as it stands."""
+    """Return the path of the command's capture, so that its advice can be pasted and run."""
     context = click.get_current_context(silent=True)
     given = context.params.get("capture") if context else None
     return shlex.quote(str(given)) if given else "capture.nc"
 
 
 def _option(name: str, value: str, other: str | None) -> str:
-    """`--method importance or nuts`, quoted as a shell needs it."""
+    """Format `--method importance or nuts`, quoted as a shell needs it."""
     values = (shlex.quote(each) for each in (value, other) if each)
     return f"{KEYWORDS[name]} {' or '.join(values)}"
 
 
 def _nuts_options(arguments: str) -> str:
-    """`--warmup 1000 --most-draws 20000`, or the call where a setting has no option of its own."""
+    """Format `--warmup 1000 --most-draws 20000`, or the call if a setting has no option."""
     pairs = [part.split("=") for part in arguments.strip("()").split(", ")]
     if all(len(pair) == 2 and pair[0] in NUTS_OPTIONS for pair in pairs):
         return " ".join(f"--{name.replace('_', '-')} {value}" for name, value in pairs)

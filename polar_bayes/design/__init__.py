@@ -1,4 +1,4 @@
-"""What can a capture tell, before or after it is made?"""
+"""Experimental design: what a capture determines, and which views to take next."""
 
 from polar_bayes.namespace import attach
 

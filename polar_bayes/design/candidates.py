@@ -1,4 +1,4 @@
-"""Candidate views: which of them a set-up can take, and one capture that holds them all."""
+"""Candidate views: constraints of the set-up, and one capture that holds all candidates."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -21,12 +21,12 @@ from polar_bayes.setups import SETUPS
 
 
 Directions = Float[np.ndarray, "view 4"]
-"""View zenith and azimuth, light zenith and azimuth, in degree."""
+"""View zenith, view azimuth, light zenith and light azimuth, unit degree."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Constraints:
-    """Views that a set-up can take.
+    """Constraints on the views that a set-up can take.
 
     Args:
         view_zenith: Least and largest, unit degree, range [0, 90].
@@ -62,7 +62,7 @@ class Constraints:
                 raise FitError(f"{name} is {angle:g}", where="Constraints", hint=hint)
 
     def allows(self, candidates: Directions, measured: Directions) -> Bool[np.ndarray, " view"]:
-        """Which candidates can be taken, given the views that were measured."""
+        """Return True for candidates that can be taken, given the views that were measured."""
         allowed = _angle(candidates[:, :2], candidates[:, 2:]) >= self.from_light
         for column, (low, high) in ((0, self.view_zenith), (2, self.light_zenith)):
             allowed &= (candidates[:, column] >= low) & (candidates[:, column] <= high)
@@ -71,7 +71,7 @@ class Constraints:
         return allowed
 
     def conflicts(self, candidates: Directions) -> Bool[np.ndarray, "view view"]:
-        """Which pairs of candidates exclude each other; a view itself, if it is not repeatable."""
+        """Return which pairs of candidates exclude each other; a view itself, if unrepeatable."""
         near = self._too_near(candidates, candidates)
         if self.repeatable:
             near &= _distance(candidates, candidates) > self.same_direction
@@ -82,13 +82,13 @@ class Constraints:
 
 
 def _distance(some: Directions, others: Directions) -> Float[np.ndarray, "some other"]:
-    """The larger of the angles between two viewers and between two lights."""
+    """Return the larger of the angles between two viewers and between two lights."""
     viewers = _angle(some[:, None, :2], others[None, :, :2])
     return np.maximum(viewers, _angle(some[:, None, 2:], others[None, :, 2:]))
 
 
 def _angle(some: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Degrees between directions (zenith, azimuth)."""
+    """Return the angle in degrees between directions (zenith, azimuth)."""
     apart = unit_vectors(some) - unit_vectors(others)
     half = 0.5 * np.linalg.norm(apart, axis=-1)  # an arc cosine loses small angles
     return np.degrees(2.0 * np.arcsin(np.minimum(half, 1.0)))
@@ -100,7 +100,7 @@ def _angle(some: np.ndarray, others: np.ndarray) -> np.ndarray:
 def candidate_links(
     problem: DesignProblem, readings: Sequence[str] | Mapping[str, AbstractLink] | None
 ) -> dict[str, AbstractLink]:
-    """The link of every reading that new views record."""
+    """Return the link of every variable that new views record."""
     request, observed = problem.request, problem.program.observed
     if readings is None:
         return {name: link for name, link in request.links.items() if name in observed}
@@ -119,7 +119,7 @@ def candidate_links(
 
 
 def _link_of(request: Request, name: str, given: AbstractLink | None) -> AbstractLink:
-    """The link that was given, or that of the capture, of related readings, or of the set-up."""
+    """Return the link that was given, or that of the capture, a related variable or the set-up."""
     where = f"next_views: readings: {name!r}"
     if name not in READINGS:
         hint = f"give some of {', '.join(READINGS)}"
@@ -143,7 +143,7 @@ def _link_of(request: Request, name: str, given: AbstractLink | None) -> Abstrac
 
 
 PLACEHOLDERS = {"dop": 0.5, "q": 0.0, "u": 0.0, "intensity": 0.0}
-"""Readings of views that were not taken; the expected information does not depend on them."""
+"""Readings of views that were not taken; the expected information is independent of them."""
 
 
 class CandidateViews(NamedTuple):
@@ -155,7 +155,7 @@ class CandidateViews(NamedTuple):
 
 
 def view_directions(views: xr.Dataset) -> Directions:
-    """The four angles of every view; those of the first patch where each has its own."""
+    """Return the four angles of every view; those of the first patch if patches differ."""
     columns = []
     for name in ANGLES:
         angle = views[name]
@@ -165,7 +165,7 @@ def view_directions(views: xr.Dataset) -> Directions:
 
 
 def _default_candidates(capture: xr.Dataset, limit: float) -> xr.Dataset:
-    """Views every 2.5 degrees in the azimuths and under the lights that the capture has."""
+    """List views every 2.5 degrees in the capture's azimuths and under its lights."""
     measured = view_directions(capture)
     zeniths = np.arange(2.5, min(limit, 87.5) + 1e-9, 2.5)
     # Where the light's zenith mirrors the viewer's in every view, as on a goniometer, it does so
@@ -211,14 +211,14 @@ def join_candidates(
 
 
 def _filled(variable: xr.DataArray, values: xr.DataArray | bool) -> xr.DataArray:
-    """Values broadcast to the dims of a variable, in their order."""
+    """Broadcast values to the dims of a variable, in their order."""
     return (xr.zeros_like(variable) + values).transpose(*variable.dims)
 
 
 def _with_readings(
     capture: xr.Dataset, candidates: xr.Dataset, readings: Sequence[str]
 ) -> xr.Dataset:
-    """The capture with every variable that the model and the candidates have."""
+    """Add every variable that the model or the candidates have to the capture."""
     labels = ["view"] if "view" in capture.coords else []
     old = capture.drop_vars([n for n in capture if str(n).startswith("true_")] + labels)
     signal = next(old[name] for name in READINGS if name in old)
@@ -234,7 +234,7 @@ def _with_readings(
 
 
 def _checked(capture: xr.Dataset, candidates: xr.Dataset) -> xr.Dataset:
-    """The candidates' angles, errors and wavelengths, with the capture's light if it has one."""
+    """Return angles, errors and wavelengths of the candidates, with the capture's single light."""
     where = "next_views: candidates"
     if not isinstance(candidates, xr.Dataset) or "view" not in candidates.dims:
         hint = "give an xarray.Dataset with view_zenith and view_azimuth over a dim view"
@@ -267,7 +267,7 @@ def _checked(capture: xr.Dataset, candidates: xr.Dataset) -> xr.Dataset:
 def _measured_wavelengths(
     capture: xr.Dataset, candidates: xr.Dataset
 ) -> Bool[np.ndarray, " wavelength"]:
-    """Which of the capture's wavelengths the candidates measure."""
+    """Return which of the capture's wavelengths the candidates measure."""
     where = "next_views: candidates: wavelength"
     if "wavelength" not in candidates.coords:
         return np.ones(capture.sizes.get("wavelength", 1), bool)

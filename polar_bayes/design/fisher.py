@@ -1,4 +1,4 @@
-r"""Fisher information of a capture's readings about a model's unconstrained coordinates.
+r"""Fisher information of readings about the unconstrained coordinates of a model.
 
 $$ F(z) = \sum_{readings} J^T I(\phi) J, \quad J = \partial\phi / \partial z $$
 
@@ -42,11 +42,11 @@ from polar_bayes.priors import unwrapped
 
 
 NODES = 400
-"""Equally likely readings over which the information of a saturating sensor is averaged."""
+"""Number of equally likely readings that average the information of a saturating sensor."""
 
 FAR_FROM_MARGIN, MARGIN_NODES = 4.0, 128
-"""Sds of a Beta distribution from the margin beyond which none of its readings lies there (1e-5);
-readings between the margins over which the information is averaged elsewhere."""
+"""Sds between the mean of a Beta distribution and the margin from which no reading lies there
+(1e-5); number of readings that average the information elsewhere."""
 
 
 FisherInformation = tuple[tuple[Array, ...], Array]
@@ -54,7 +54,7 @@ FisherInformation = tuple[tuple[Array, ...], Array]
 
 
 def information(distribution: dist.Distribution) -> FisherInformation:
-    """Fisher information of one reading about the parameters of its distribution."""
+    """Return the Fisher information of one reading about its distribution's parameters."""
     shape = distribution.batch_shape
     distribution = unwrapped(distribution)
     formula = _FORMULAS.get(type(distribution))
@@ -68,7 +68,7 @@ def information(distribution: dist.Distribution) -> FisherInformation:
 
 
 def _symmetric(first: Array, across: Array, second: Array) -> Array:
-    """The 2 x 2 matrix [[first, across], [across, second]]."""
+    """Return the 2 x 2 matrix [[first, across], [across, second]]."""
     entries = jnp.broadcast_arrays(first, across, across, second)
     return jnp.stack(entries, axis=-1).reshape(*entries[0].shape, 2, 2)
 
@@ -80,7 +80,7 @@ def _normal(normal: dist.Normal) -> FisherInformation:
 
 
 def _student(student: dist.StudentT) -> FisherInformation:
-    """Location and scale; degrees of freedom are given. Lange et al. (1989), JASA 84, 881-896."""
+    """Information on location and scale of Student's t: Lange et al. (1989), JASA 84, 881-896."""
     freedom, precision = student.df, student.scale**-2.0
     location = (freedom + 1.0) / (freedom + 3.0) * precision
     scale = 2.0 * freedom / (freedom + 3.0) * precision
@@ -89,7 +89,7 @@ def _student(student: dist.StudentT) -> FisherInformation:
 
 
 def _sensor(sensor: SensorStudentT) -> FisherInformation:
-    """Location and scale; the mean outer product of the score over quantiles of the noise."""
+    """Information on location and scale: the mean outer product of scores at noise quantiles."""
     freedom = sensor.degrees_of_freedom
     nodes = scipy.stats.t(freedom).ppf((np.arange(NODES) + 0.5) / NODES)
 
@@ -112,7 +112,10 @@ def _sensor(sensor: SensorStudentT) -> FisherInformation:
 
 
 def _beta(beta: MeanConcentrationBeta) -> FisherInformation:
-    r"""Mean and concentration: for the mean $\kappa^2[\psi_1(\mu\kappa)+\psi_1((1-\mu)\kappa)]$."""
+    r"""Information on mean and concentration.
+
+    The information on the mean is $\kappa^2[\psi_1(\mu\kappa)+\psi_1((1-\mu)\kappa)]$.
+    """
     mean, concentration = beta.mean_value, beta.concentration
     first, second, whole = (
         polygamma(1, x) for x in (mean * concentration, (1.0 - mean) * concentration, concentration)
@@ -132,7 +135,7 @@ def _beta(beta: MeanConcentrationBeta) -> FisherInformation:
 
 
 def _censored_beta(mean: Array, concentration: Array, margin: float) -> Array:
-    """The mean outer product of the score: between the margins by quadrature, and at their ends."""
+    """Mean outer product of scores: by quadrature between the margins, and at both ends."""
     end = math.log(margin) - math.log1p(-margin)
     nodes, weights = np.polynomial.legendre.leggauss(MARGIN_NODES)
     inside = scipy.special.expit(end * nodes)
@@ -163,7 +166,7 @@ _FORMULAS: Mapping[type, Callable] = {
 
 
 class ReadingInformation(NamedTuple):
-    """Terms of the Fisher information of one variable's readings; 0 where they are not valid."""
+    """Factors of the Fisher information of one variable; 0 where readings are not valid."""
 
     jacobian: Float[Array, "... parameter size"]
     information: Float[Array, "... parameter parameter"]
@@ -173,7 +176,7 @@ class ReadingInformation(NamedTuple):
 def reading_information(
     program: Program, z: Float[Array, " size"], data: Observations
 ) -> dict[str, ReadingInformation]:
-    """Jacobians and information matrices of all readings, by variable."""
+    """Return Jacobians and information matrices of all readings, by variable."""
 
     # The Jacobian and what is only evaluated come from one pass, so the optics run once.
     def with_aux(z: Array) -> tuple[dict[str, Array], dict[str, tuple]]:
@@ -198,7 +201,7 @@ def reading_information(
 
 
 def total_information(readings: Mapping[str, ReadingInformation]) -> Float[Array, "size size"]:
-    """Fisher information of all readings about the unconstrained coordinates."""
+    """Return the Fisher information of all readings about the unconstrained coordinates."""
     total = functools.partial(jnp.einsum, "...ki,...kl,...lj->ij")
     parts = [total(each.jacobian, each.information, each.jacobian) for each in readings.values()]
     return jnp.sum(jnp.stack(parts), axis=0)
@@ -207,7 +210,7 @@ def total_information(readings: Mapping[str, ReadingInformation]) -> Float[Array
 def information_by_view(
     readings: Mapping[str, ReadingInformation], axes: tuple[int, ...]
 ) -> dict[str, Float[Array, "reading size size"]]:
-    """The same for every variable and view, or every wavelength and view: the last axes."""
+    """Return the information by variable and view (and wavelength), on the last axes."""
     views = int(np.prod(axes))
 
     def by_view(jacobian: Array, matrix: Array) -> Array:
@@ -220,7 +223,7 @@ def information_by_view(
 def paper_information(
     readings: Mapping[str, ReadingInformation], size: int
 ) -> tuple[Float[Array, "size size"], Float[Array, "size size"]]:
-    """The paper's sum over the readings with Beta noise, and the exact one about their means."""
+    """Return the paper's sum over readings with Beta noise, and the exact information."""
     # The noise counts as known in both: only the means move.
     # Source: The paper, on identifiability: the sum of kappa S S' over views.
     of_beta = [each for each in readings.values() if each.concentration is not None]
@@ -246,14 +249,14 @@ def paper_information(
 def prior_precision(
     program: Program, z: Float[Array, " size"], data: Observations
 ) -> Float[Array, "size size"]:
-    """Hessian of minus the log prior of the unconstrained coordinates."""
+    """Return the Hessian of minus the log prior of the unconstrained coordinates."""
     return jax.hessian(lambda z: program.prior_potential(z, data))(z)
 
 
 def positive_definite(
     hessian: Float[np.ndarray, "size size"], draws: Float[np.ndarray, "draw size"]
 ) -> Float[np.ndarray, "size size"]:
-    """A prior's Hessian, or the inverse covariance of its draws where it is not definite."""
+    """Return a prior's Hessian, or the inverse covariance of its draws if it is indefinite."""
     # Far in the tail of a bounded prior, and in the funnel of a population, the log density is not
     # concave in every direction.
     try:

@@ -44,7 +44,7 @@ def identify(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> xr.Dataset:
-    r"""What a capture determines, by the Fisher information of its readings at the mode.
+    r"""Compute what a capture determines, by the Fisher information at the posterior mode.
 
     The expected posterior covariance is $(F + P)^{-1}$, with $F$ the information of all readings
     and $P$ the curvature of the prior; noise and instrument parameters are unknown in it.
@@ -121,7 +121,7 @@ def _identify_at(problem: DesignProblem, mode: np.ndarray) -> xr.Dataset:
     inverse = np.linalg.pinv(jacobian)
 
     def conditional(information: np.ndarray) -> np.ndarray:
-        """Information about each parameter where all others are known."""
+        """Return the information about each parameter where all others are known."""
         return np.maximum(np.einsum("ip,ij,jp->p", inverse, information, inverse), 0.0)
 
     sensitivity = np.sqrt(conditional(information))
@@ -155,17 +155,17 @@ def _identify_at(problem: DesignProblem, mode: np.ndarray) -> xr.Dataset:
 
 
 UNDETERMINED, PARTLY = 0.8, 0.3
-"""Share of the prior in a parameter's variance from which it is not, or only partly, determined."""
+"""Shares of prior in a parameter's variance from which it is not, or only partly, determined."""
 
 
 def identifiability_table(found: xr.Dataset) -> pd.DataFrame:
-    """What `identify` found, one row for each parameter."""
+    """Return the results of `identify`, one row for each parameter."""
     columns = ["value", "prior_sd", "expected_sd", "prior_share", "sensitivity", "paper_sd"]
     return found[columns].drop_vars("name").to_dataframe()
 
 
 def identifiability_sentences(found: xr.Dataset) -> list[str]:
-    """Which parameters of the material are not determined, and which trade off.
+    """State which material parameters are not determined, and which trade off.
 
     The weakest direction is stated where it is one of the material, several parameters are part of
     it, and the prior determines more of it than the data do.
@@ -186,7 +186,7 @@ def identifiability_sentences(found: xr.Dataset) -> list[str]:
 
 
 def _weakest_direction(found: xr.Dataset, is_material: np.ndarray) -> list[str]:
-    """The direction of least information, where its parameters one by one would be determined."""
+    """Describe the direction of least information, if it is weaker than each parameter."""
     weakest = found.isel(direction=0)
     weight, movement = weakest["weight"].to_numpy(), weakest["movement"].to_numpy()
     parts = np.flatnonzero(movement >= 0.3 * movement.max())
@@ -206,7 +206,7 @@ def _weakest_direction(found: xr.Dataset, is_material: np.ndarray) -> list[str]:
 
 
 def _correlated_pairs(found: xr.Dataset, is_material: np.ndarray) -> list[str]:
-    """Pairs of a determined parameter of the material with one like it or of the instrument."""
+    """List correlated pairs of a determined material parameter and another parameter."""
     correlation, names = found["correlation"].to_numpy(), found["parameter"].to_numpy()
     first = is_material & (found["prior_share"].to_numpy() < UNDETERMINED)
     second = first | ~is_material

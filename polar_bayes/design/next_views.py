@@ -1,4 +1,4 @@
-"""Optimal design of further views: which of them would narrow the posterior most.
+"""Optimal design of further views: those that narrow the posterior most.
 
 Fedorov exchange (Fedorov 1972) on a criterion of the expected covariance, averaged over draws of
 the posterior (Chaloner & Verdinelli 1995).
@@ -59,7 +59,7 @@ from polar_bayes.scenes.scene_file import arguments_of
 
 
 class Design(NamedTuple):
-    """Information of the capture with its prior, and of every candidate, at draws of the posterior.
+    """Information of the capture with its prior, and of every candidate, at posterior draws.
 
     `jacobian` (draw, parameter, size) is that of the parameters by the coordinates; the last three
     say which view, wavelength and reading each candidate is, -1 and "" where it has them all.
@@ -73,12 +73,12 @@ class Design(NamedTuple):
     reading: np.ndarray
 
     def covariance(self, information: np.ndarray) -> np.ndarray:
-        """Expected covariance of the parameters, (draw, option, parameter, parameter)."""
+        """Return the expected covariance, (draw, option, parameter, parameter)."""
         jacobian = self.jacobian[:, None]
         return jacobian @ np.linalg.inv(information) @ np.swapaxes(jacobian, -1, -2)
 
     def conflicts(self, between_views: np.ndarray, repeatable: bool) -> np.ndarray:
-        """Which candidates exclude each other; wavelengths and readings of one view do not."""
+        """Return which candidates exclude each other; readings of one view do not."""
         same_view = self.view[:, None] == self.view
         same = (
             same_view
@@ -109,7 +109,7 @@ def next_views(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> xr.Dataset:
-    r"""Views that would narrow the posterior of a capture most, and the widths to expect.
+    r"""Select views that would narrow the posterior most, and predict the widths.
 
     The information of the capture, of the prior and of every candidate is known for any value of
     the parameters; the criterion of the covariance $(P + F + \sum F_{picked})^{-1}$ is averaged
@@ -173,7 +173,7 @@ def next_views(
 
 
 def _asked_of(fit: xr.DataTree, model: str | Callable, *others: object) -> tuple:
-    """The model of a fit, and what it was asked for besides where nothing else is given."""
+    """Return the model of a fit, and its arguments where the caller gives no others."""
     stated = arguments_of(fit)
     names = ("scene", "priors", "links", "largest_view_zenith")
     given = dict(zip(names, others, strict=True))
@@ -198,7 +198,7 @@ def _selected(
     constraints: Constraints | None,
     count: int,
 ) -> xr.Dataset:
-    """The candidates that lower the criterion most, and what they are expected to do."""
+    """Select candidates that lower the criterion most, and predict their effect."""
     criterion, constraints = criterion or DOptimal(), constraints or Constraints()
     request, scalars = extended.request, extended.scalars
     rows = [i for i, one in enumerate(scalars) if one.name in MATERIAL_PARAMETERS]
@@ -229,7 +229,7 @@ def _extended(
     model: str | Callable,
     priors: Mapping[str, dist.Distribution] | None,
 ) -> DesignProblem:
-    """The model on measured views and candidates together."""
+    """Return the model on measured views and candidates together."""
     links = {**problem.request.links, **new}
     limit, seed = problem.request.largest_view_zenith, problem.request.seed
     scene = problem.request.scene
@@ -259,7 +259,7 @@ def _design(
     new: tuple[str, ...],
     apart: tuple[str, ...],
 ) -> Design:
-    """The information of every candidate at every draw, from one compiled program."""
+    """Compute the information of every candidate at every draw by one compiled program."""
     program, data, count = extended.program, extended.data, len(draws)
     indices = coordinate_indices(problem.program, program)
     z = extended.prior[np.arange(count) % len(extended.prior)].copy()  # for parameters of the new
@@ -304,7 +304,7 @@ def _design(
 def _with_predicted_brightness(
     extended: DesignProblem, z: Array, data: Observations, measured: int
 ) -> Observations:
-    """The data with candidates as bright as the model predicts, which sets their noise."""
+    """Give candidates the predicted brightness, which sets their noise."""
     sensor = extended.program.trace(z, data)["intensity"]["fn"]
     predicted = jnp.clip(jnp.broadcast_to(sensor.mean, data.shape), 0.0, 1.0)
     brightness = jnp.where(jnp.arange(data.shape[-1]) < measured, data.brightness, predicted)
@@ -343,14 +343,14 @@ def _assemble(
 
 
 def next_views_table(found: xr.Dataset) -> pd.DataFrame:
-    """Width of the expected 95% interval of every parameter, before and after each view."""
+    """Return expected 95% widths of every parameter before and after each view."""
     table = found["interval_width"].transpose("parameter", "step").to_pandas()
     table.columns = ["now", *(f"after {step}" for step in table.columns[1:])]
     return table
 
 
 def next_views_sentences(found: xr.Dataset) -> list[str]:
-    """Which views to take next, by how much the intervals narrow, and which hardly do."""
+    """State which views to take next, and by how much which intervals narrow."""
     widths = found["interval_width"].transpose("step", "parameter")
     before, after = widths.isel(step=0).to_numpy(), widths.isel(step=-1).to_numpy()
     names = found["parameter"].to_numpy()
@@ -366,7 +366,7 @@ def next_views_sentences(found: xr.Dataset) -> list[str]:
 
 
 def _view_texts(found: xr.Dataset) -> list[str]:
-    """Such as `zenith 10, azimuth 180`; with the light where it moves."""
+    """Format views as `zenith 10, azimuth 180`, with the light if it moves."""
     light_moves = any(np.ptp(found[f"light_{angle}"].to_numpy()) for angle in ("zenith", "azimuth"))
     texts = []
     for pick in range(found.sizes["pick"]):

@@ -23,11 +23,11 @@ Losses = Float[np.ndarray, "..."]
 
 @dataclasses.dataclass(frozen=True)
 class AbstractCriterion(abc.ABC):
-    """One number for an expected covariance: the smaller, the better."""
+    """A scalar measure of an expected covariance, to be minimized."""
 
     @abc.abstractmethod
     def loss(self, covariance: Covariance, parameters: Sequence[str]) -> Losses:
-        """The number that a choice of views makes small.
+        """Return the number that a choice of views is to minimize.
 
         Args:
             covariance: Expected covariance of the material's parameters, in their prior sds.
@@ -43,7 +43,7 @@ class AbstractCriterion(abc.ABC):
 
 @dataclasses.dataclass(frozen=True)
 class DOptimal(AbstractCriterion):
-    r"""The volume of the joint credible region: $\tfrac12 \log\det$ of the covariance.
+    r"""Volume of the joint credible region: $\tfrac12 \log\det$ of the covariance.
 
     It does not depend on units, and counts what parameters share.
 
@@ -60,7 +60,7 @@ class DOptimal(AbstractCriterion):
 
 @dataclasses.dataclass(frozen=True)
 class AOptimal(AbstractCriterion):
-    """The sum of the variances of all parameters, each in squared prior sds.
+    """Sum of the variances of all parameters, each in squared prior sds.
 
     Source:
         Atkinson, Donev & Tobias (2007), Optimum Experimental Designs, chapter 10.
@@ -73,7 +73,7 @@ class AOptimal(AbstractCriterion):
 
 @dataclasses.dataclass(frozen=True)
 class SingleParameter(AbstractCriterion):
-    """The variance of one parameter, in squared prior sds; all others are nuisance.
+    """Variance of one parameter, in squared prior sds; all others are nuisance parameters.
 
     Args:
         name: Such as "refractive_index" (summed over wavelengths or patches where it has several
@@ -100,7 +100,7 @@ Loss = Callable[[Float[np.ndarray, "draw option size size"]], Float[np.ndarray, 
 
 
 class Selection(NamedTuple):
-    """Candidates in the order in which each lowers the loss most, and the losses from none on."""
+    """Candidates in the order of selection, and the loss before and after each."""
 
     picks: list[int]
     losses: list[float]
@@ -150,7 +150,7 @@ def fedorov_exchange(
 def _best_addition(
     loss: Loss, base: np.ndarray, each: np.ndarray, picks: list[int], options: list[int]
 ) -> tuple[int, float]:
-    """The option whose information, added to that of the picks, has the smallest loss."""
+    """Return the option whose information, added to that of the picks, has the lowest loss."""
     known = base + each[:, picks].sum(axis=1)
     losses = loss(known[:, None] + each[:, options])
     at = int(np.argmin(losses))

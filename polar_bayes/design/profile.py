@@ -51,7 +51,7 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress, with_progress
 
 KINDS = {"posterior": 1.0, "likelihood": 1e-3}
-"""The weight of the log prior in either kind of profile."""
+"""Weight of the log prior in each kind of profile."""
 
 
 @with_progress
@@ -69,7 +69,7 @@ def profile(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> xr.Dataset:
-    r"""Profile likelihood and profile posterior of one parameter.
+    r"""Compute the profile likelihood and the profile posterior of one parameter.
 
     $$ \ell_p(\theta) = \max_{\nu} \log L(\theta, \nu) $$
 
@@ -134,7 +134,7 @@ def profile(
 
 
 def _find_coordinate(problem: DesignProblem, parameter: str) -> Coordinate:
-    """The coordinate of a scalar parameter that is sampled."""
+    """Return the coordinate of a scalar parameter that is sampled."""
     program, every = problem.program, label_coordinates(problem.program, problem.request.capture)
     known = [each for each in every if each.is_entry and each.site not in program.auxiliary]
     found = [each for each in known if parameter in (each.label, each.site)]
@@ -148,7 +148,7 @@ def _find_coordinate(problem: DesignProblem, parameter: str) -> Coordinate:
 def _unconstrained(
     problem: DesignProblem, coordinate: Coordinate, values: Sequence[float]
 ) -> np.ndarray:
-    """Values of a parameter as values of its coordinate."""
+    """Convert values of a parameter to values of its coordinate."""
     program, entry = problem.program, coordinate.entry
     support = program.supports[coordinate.site]
     template = np.asarray(program.constrain(jnp.zeros(program.size))[coordinate.site])
@@ -220,7 +220,7 @@ def log_density_parts(
 
 
 def _weighted_potential(compiled_model: CompiledModel, known: frozenset[str]) -> JitOnce:
-    """Minus log likelihood and weighted log prior with their gradient, given weight and data."""
+    """Return minus log likelihood and weighted log prior, with gradient, as a function."""
 
     def potential(z: Array, given: tuple[float | Array, Observations]) -> Array:
         weight, data = given
@@ -234,7 +234,7 @@ def _weighted_potential(compiled_model: CompiledModel, known: frozenset[str]) ->
 
 
 class ProfileCurve(NamedTuple):
-    """Profiles by kind on one grid of the coordinate, and their arguments; NaN where none ended."""
+    """Profiles by kind on one grid of the coordinate; NaN where no search converged."""
 
     grid: np.ndarray
     value: np.ndarray
@@ -244,7 +244,7 @@ class ProfileCurve(NamedTuple):
 def _trace_profile(
     index: int, modes: Modes, potentials: Sequence[ValueAndGradient], grid: np.ndarray
 ) -> ProfileCurve:
-    """Follow both kinds from the first three modes to both ends of the grid, and keep the best."""
+    """Follow both kinds from the first three modes across the grid, and keep the best."""
     slope, factor = conditional_normal(modes.covariance[0], index)
     value = np.full((len(potentials), grid.size), np.nan)
     best = np.full((len(potentials), grid.size, slope.size), np.nan)
@@ -267,7 +267,7 @@ def _trace_profile(
 
 
 def _log_density_at(potential: ValueAndGradient, z: np.ndarray, factor: np.ndarray) -> float:
-    """The log density at the end of an optimization; NaN where it is no conditional mode."""
+    """Return the log density where an optimization ended; NaN if that is no mode."""
     if not np.isfinite(z).all():
         return np.nan
     loss, gradient = potential(z)
@@ -286,7 +286,7 @@ def _on_default_grid(
     prior: np.ndarray,
     points: int,
 ) -> ProfileCurve:
-    """Profiles four sds to either side, or over almost all of the prior where they stay open."""
+    """Compute profiles over four sds to either side, or most of the prior if still open."""
     center = modes.z[0, index]
     reach = 4.0 * float(np.sqrt(modes.covariance[0][index, index]))
     half = points // 2
@@ -305,7 +305,7 @@ def _on_default_grid(
 
 
 def likelihood_interval(theta: np.ndarray, value: np.ndarray) -> tuple[float, float, bool, bool]:
-    """Ends of the values at which a profile has fallen by less than 1.92, and which are open."""
+    """Return the ends of the likelihood interval (drop below 1.92), and which are open."""
     known = np.flatnonzero(np.isfinite(value))
     if known.size == 0:
         return np.nan, np.nan, True, True
@@ -314,7 +314,7 @@ def likelihood_interval(theta: np.ndarray, value: np.ndarray) -> tuple[float, fl
     inside = known[drop[known] < most]
 
     def end(at: int, beyond: np.ndarray) -> tuple[float, bool]:
-        """The interpolated end next to the last point inside; `beyond`: points outside of it."""
+        """Interpolate the end next to the last point inside; `beyond` are points outside."""
         if beyond.size == 0:
             return float(theta[at]), True
         other = beyond[np.argmin(np.abs(beyond - at))]
@@ -333,14 +333,14 @@ def likelihood_interval(theta: np.ndarray, value: np.ndarray) -> tuple[float, fl
 
 
 def profile_table(found: xr.Dataset) -> pd.DataFrame:
-    """Both profiles by value of the parameter: logarithms, 0 at the best, NaN where none ended."""
+    """Return both log profiles by value of the parameter, relative to their maxima."""
     table = found["profile"].transpose("value", "kind").to_pandas()
     table.index.name, table.columns.name = str(found.attrs["parameter"]), None
     return table
 
 
 def profile_sentences(found: xr.Dataset) -> list[str]:
-    """What the data exclude, where the profile is flat, and where no fit converged."""
+    """State what the data exclude, where the profile is flat, and what did not converge."""
     sentences = [_interval_sentence(str(found.attrs["parameter"]), found.sel(kind="likelihood"))]
     failed = int(np.sum(~found["converged"]))
     if failed:

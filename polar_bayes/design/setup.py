@@ -1,4 +1,4 @@
-"""Set-up of a design problem: model, capture, posterior modes, and the labels of coordinates."""
+"""The set-up of a design problem: model, capture, posterior modes and coordinate labels."""
 
 import dataclasses
 import functools
@@ -73,14 +73,14 @@ class DesignProblem:
 
 
 def provenance_attrs(request: Request, **more: object) -> dict[str, str]:
-    """The attribute of a result that holds its capture, model and settings, as JSON."""
+    """Return the attribute that holds capture, model and settings of a result as JSON."""
     capture = str(request.capture.attrs.get("name", "capture"))
     found = {**request.describe(), "capture": capture, **more}
     return {PROVENANCE: json.dumps(found, sort_keys=True)}
 
 
 def make_design_problem(request: Request) -> DesignProblem:
-    """Compile the model of a request, or take it from the cache; call it with x64 enabled."""
+    """Compile the model of a request, or find it in the cache; x64 must be enabled."""
     compiled_model, data = compile_request(request)
     prior = from_prior(compiled_model.program, jax.random.key(request.seed), PRIOR_DRAWS, data)
     return DesignProblem(request, data, compiled_model, prior)
@@ -89,7 +89,7 @@ def make_design_problem(request: Request) -> DesignProblem:
 def posterior_modes(
     problem: DesignProblem, progress: Progress | None, potential: ValueAndGradient | None = None
 ) -> Modes:
-    """The modes of the posterior, all coordinates together, heaviest first."""
+    """Return the joint posterior modes, the one of largest weight first."""
     potential = potential or NumpyPotential(
         problem.program.value_and_gradient, problem.data, problem.data.brightness.dtype
     )
@@ -102,7 +102,7 @@ def posterior_modes(
 def parameter_vector(
     program: Program, z: Float[Array, " size"], data: Observations
 ) -> Float[Array, " parameter"]:
-    """All parameters in one vector, by name."""
+    """Return all parameters as one vector, in alphabetical order."""
     return ravel_pytree(program.parameters(z, data))[0]
 
 
@@ -112,7 +112,7 @@ def parameter_vector(
 def posterior_draws(
     problem: DesignProblem, result: xr.DataTree | None, count: int, progress: Progress | None
 ) -> Float[np.ndarray, "draw size"]:
-    """Draws of a fit, or else of the Laplace approximation at the heaviest mode."""
+    """Return draws of a fit, or of the Laplace approximation at the heaviest mode."""
     if result is not None:
         return _fit_draws(problem, result, count)
     modes = posterior_modes(problem, progress)
@@ -125,7 +125,7 @@ def posterior_draws(
 def _fit_draws(
     problem: DesignProblem, result: xr.DataTree, count: int
 ) -> Float[np.ndarray, "draw size"]:
-    """Finite draws of a fit, evenly spaced, as unconstrained vectors."""
+    """Return finite, evenly spaced draws of a fit as unconstrained vectors."""
     where, program = "next_views: result", problem.program
     check_fit(result, where)
     template = program.latent_shapes
@@ -152,13 +152,13 @@ def _fit_draws(
 def unconstrain(
     program: Program, values: Mapping[str, Float[np.ndarray, "draw ..."]]
 ) -> Float[np.ndarray, "draw size"]:
-    """Draws of all latent sites as unconstrained vectors."""
+    """Convert draws of all latent sites to unconstrained vectors."""
     sites = {name: values[name] for name in program.supports}
     return np.asarray(compiled(jax.vmap(program.unconstrain))(sites))
 
 
 def coordinate_indices(program: Program, extended: Program) -> Int[np.ndarray, " size"]:
-    """Indices of a program's coordinates in that of the same model with more views."""
+    """Map a program's coordinates to those of the same model with more views."""
     theirs = extended.positions
     indices = np.zeros(program.size, int)
     for name, position in program.positions.items():

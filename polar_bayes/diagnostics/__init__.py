@@ -1,4 +1,4 @@
-"""What a finished fit is worth: convergence, predictive checks, what the data determine."""
+"""Diagnostics of a finished fit: convergence, model criticism, predictive checks, sensitivity."""
 
 from polar_bayes.namespace import attach
 

@@ -1,4 +1,4 @@
-"""What a fit assumes: alternatives to parts of its scene, and the answers that they give."""
+"""Alternatives to parts of a fit's scene, and the answers that they give."""
 
 import pandas as pd
 import xarray as xr
@@ -9,13 +9,13 @@ from polar_bayes.errors import FitError
 from polar_bayes.frames import PrintedFrame
 
 NOTHING = "nothing"
-"""The part in the place of which a layer that nobody sees would be."""
+"""Name of the part that an additional, unseen layer would replace."""
 
 COLUMNS = ("part", "alternative", "path", "log_bayes_factor", "mean", "other", "shift", "redefined")
 
 
 def alternatives(result: xr.DataTree | FitView) -> pd.DataFrame:
-    """Answers of the scenes that have another part in the place of one, as the fit has found them.
+    """Return the alternatives of a fit: for each, its evidence and its answer.
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.

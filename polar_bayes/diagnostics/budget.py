@@ -1,4 +1,4 @@
-r"""The uncertainty budget of a fit: how much of each interval is noise, prior and set-up.
+r"""Uncertainty budget of a fit: the contributions of noise, prior and set-up to each interval.
 
 The rows are in the words of the GUM: each input quantity of the set-up has a standard uncertainty
 u, that of its prior, and contributes to a parameter
@@ -36,7 +36,7 @@ from polar_bayes.setups import check_uncertainty
 def budget(
     result: xr.DataTree | FitView, *, known: Mapping[str, float] | None = None
 ) -> pd.DataFrame:
-    """How much of the uncertainty of each material parameter comes from what.
+    """Compute the uncertainty budget of each material parameter.
 
     Args:
         result: A fit, fresh or loaded, whose scene has input quantities or other terms of an
@@ -56,7 +56,7 @@ def budget(
     fit = view_of(result)
     if not has_budget(fit):
         raise FitError(
-            "it does not say what its set-up is known to",
+            "it has no input quantities of its set-up",
             where="budget: result",
             hint="fit with a set-up whose scene has input quantities, such as camera",
         )
@@ -80,31 +80,31 @@ def budget(
 
 
 def has_budget(fit: FitView) -> bool:
-    """Whether a fit has intervals and input quantities."""
+    """Return whether a fit has intervals and input quantities."""
     return fit.method != "point" and bool(_errors(fit))
 
 
 def _errors(fit: FitView) -> dict[str, Scalar]:
-    """The input quantities, by name."""
+    """Return the draws of the input quantities, by name."""
     known = fit.provenance.get("known") or {}
     usable = (each for each in fit.scalars if (known.get(each.name) or 0.0) > 0.0)
     return {each.name.removesuffix("_offset"): each for each in usable}
 
 
 def _stated(fit: FitView) -> pd.Series:
-    """Their standard uncertainties, by name."""
+    """Return the standard uncertainties of the input quantities, by name."""
     return pd.Series({n: fit.provenance["known"][each.name] for n, each in _errors(fit).items()})
 
 
 def _covariance(scalar: Scalar, errors: Mapping[str, Scalar]) -> Float[np.ndarray, "n n"]:
-    """Of a parameter, first, and the input quantities."""
+    """Return the covariance of a parameter, first, and the input quantities."""
     return np.cov(np.stack([each.draws.ravel() for each in (scalar, *errors.values())]))
 
 
 def _row(
     joint: Float[np.ndarray, "n n"], noise: float, stated: pd.Series, asked: pd.Series
 ) -> list[float]:
-    """One parameter: its sd, that of a perfect set-up, and what contributes to it."""
+    """Return the sd of one parameter, its sd for a perfect set-up, and all contributions."""
     if not np.isfinite(joint).all():
         return [np.nan] * (4 + len(stated))
     variance, with_errors = _known_otherwise(joint, stated, asked)
@@ -118,7 +118,7 @@ def _row(
 def _known_otherwise(
     joint: Float[np.ndarray, "n n"], stated: pd.Series, asked: pd.Series
 ) -> tuple[float, Float[np.ndarray, " quantity"]]:
-    """Variance of a parameter, and covariances, where priors of quantities are as asked."""
+    """Return variance and covariances of a parameter under other priors of input quantities."""
     # Other standard uncertainties change the precision of each prior.
     change = np.diag(asked.to_numpy() ** -2.0 - stated.to_numpy() ** -2.0)
     left = np.linalg.lstsq(np.eye(len(stated)) + joint[1:, 1:] @ change, joint[0, 1:])[0]
@@ -126,13 +126,13 @@ def _known_otherwise(
 
 
 def variance_shares(table: pd.DataFrame) -> pd.DataFrame:
-    """A budget with shares of the variance in the place of its parts."""
+    """Convert a budget from standard uncertainties to shares of the variance."""
     parts = table.drop(columns=["sd", "perfect"]) ** 2
     return table[["sd", "perfect"]].join(parts.div(parts.sum(axis=1), axis=0))
 
 
 def _asked(stated: pd.Series, known: Mapping[str, float]) -> pd.Series:
-    """Standard uncertainties, those that the caller knows better or worse replaced."""
+    """Return standard uncertainties, with the caller's values where given."""
     for name, value in known.items():
         if name not in stated.index:
             hint = f"give some of {join(list(stated.index))}"
@@ -142,7 +142,7 @@ def _asked(stated: pd.Series, known: Mapping[str, float]) -> pd.Series:
 
 
 def _share_of_noise(scalar: Scalar, densities: list[np.ndarray | None]) -> float:
-    """Of the variance that no input quantity explains, the share of noise; the rest is prior."""
+    """Return the share of noise in the variance that no input quantity explains."""
     # Raising a density to a power a divides its part of the precision by a: the variance then
     # changes at the rate -Cov((x - mean)^2, log density), which is that part of a normal variance.
     square = (scalar.draws - scalar.draws.mean()) ** 2
@@ -170,14 +170,14 @@ def better_known(fit: FitView, label: str) -> tuple[str, float]:
 
 
 def described(fit: FitView, quantity: str, u: float) -> tuple[str, str]:
-    """What an input quantity means, and a standard uncertainty of it with its unit."""
+    """Describe an input quantity, and its standard uncertainty with its unit."""
     _, meaning, unit = notation(_errors(fit)[quantity].name)
     return meaning, f"{u:.2g}{'' if unit == '1' else f' {unit}'}"
 
 
 @once
 def wider_by_setup(fit: FitView) -> pd.Series:
-    """Factors by which the set-up widens uncertainties, the largest first; those worth a word."""
+    """Return factors by which the set-up widens uncertainties, largest first, if notable."""
     if not has_budget(fit):
         return pd.Series(dtype=float)
     table = budget(fit)
@@ -187,7 +187,7 @@ def wider_by_setup(fit: FitView) -> pd.Series:
 
 @once
 def budget_sentences(fit: FitView) -> tuple[str, ...]:
-    """What the set-up adds to intervals, where that is material; what to know better first."""
+    """State what the set-up adds to intervals, where notable, and what to know better."""
     wider = wider_by_setup(fit)
     if wider.empty:
         return ()

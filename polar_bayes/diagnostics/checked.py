@@ -1,4 +1,4 @@
-"""What was checked of a fit: the checks behind its verdict, by name."""
+"""The checks behind the verdict of a fit, by name."""
 
 import math
 
@@ -16,16 +16,16 @@ NAMES = {
     "repeats": "repeated views",
     "alternatives": "alternative parts of the scene",
 }
-"""Checks of the criticism whose own names do not say what they look at."""
+"""Descriptions of checks whose own names do not say what they examine."""
 TESTED = (
     *("noise", "systematic errors", "angle", "wavelength", "outliers", "leave-one-out"),
     "alternatives",
 )
-"""Checks that have a p-value wherever there is something to check."""
+"""Checks that have a p-value if there is anything to check."""
 
 
 def checks_made(method: str, criticism: pd.DataFrame) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """What was checked of a fit by draws, and what could not be, in words.
+    """Describe which checks of a fit were made, and which could not be.
 
     Args:
         method: The method of the fit.

@@ -79,7 +79,7 @@ def compare_fits(fits: Mapping[str, xr.DataTree]) -> FitComparison:
 
 
 def _parameters(fits: Mapping[str, FitView]) -> pd.DataFrame:
-    """The columns of both tables of each fit, parameter by parameter."""
+    """Return the columns of both tables for each parameter and fit."""
     own = ["mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk"]
     prior = ["prior_inside", "verdict", "prior_sensitivity", "likelihood_sensitivity", "remark"]
     found = {name: summary(fit)[own].join(sensitivity(fit)[prior]) for name, fit in fits.items()}
@@ -89,7 +89,7 @@ def _parameters(fits: Mapping[str, FitView]) -> pd.DataFrame:
 
 
 def _check_same_capture(one: xr.DataTree, other: xr.DataTree, first: str, name: str) -> None:
-    """Directions and readings must be the same; the readings that each fit uses may differ."""
+    """Refuse fits of different directions or readings; the fitted readings may differ."""
     for group, names in (("constant_data", ANGLES), ("observed_data", None)):
         values, expected = (
             tree[group].to_dataset() if group in tree.children else xr.Dataset()
@@ -113,7 +113,7 @@ def _agree(one: xr.DataArray, other: xr.DataArray | None) -> bool:
 
 
 def compare_predictions(fits: Mapping[str, FitView]) -> tuple[pd.DataFrame, dict[str, str]]:
-    """Expected log density of each reading given all others, best fit first; why some have none."""
+    """Rank fits by leave-one-out log density, and say why some have none."""
     left_out, found, used = {}, {}, {}
     for name, fit in fits.items():
         parts = {n: check.loo for n, check in sorted(predictive_checks(fit).items())}
@@ -139,7 +139,7 @@ def compare_predictions(fits: Mapping[str, FitView]) -> tuple[pd.DataFrame, dict
 
 
 def _combined(parts: list[Loo]) -> ELPDDataLOO:
-    """The readings of all variables as ArviZ holds them."""
+    """Stack the readings of all variables in the arrays that ArviZ expects."""
     each = xr.DataArray(np.concatenate([part.pointwise for part in parts]), dims="reading")
     return ELPDDataLOO(
         elpd=float(each.sum()),
@@ -159,7 +159,7 @@ def _combined(parts: list[Loo]) -> ELPDDataLOO:
 
 
 def stack_readings(result: xr.DataTree) -> xr.DataTree:
-    """The same result with a single axis of readings: only those that the fit has used.
+    """Return the result with one axis for all readings that the fit has used.
 
     Masked views and views beyond the angle limit stay in a result, so that its axes are those of
     the capture; their log likelihood is zero in every draw. Leave-one-out functions refuse such
@@ -210,11 +210,11 @@ def _stack(variable: xr.DataArray, reading: xr.DataArray, fitted: np.ndarray) ->
 # --- Intervals without a part of the instrument ---------------------------------------------------
 
 WITHOUT = {"discrepancy": "the discrepancy term", "instrument": "any instrument term"}
-"""Fits for comparison, in the groups `without_<key>` of a result: the terms that they omit."""
+"""Fits for comparison, in groups `without_<key>`, with the terms that each omits."""
 
 
 def compare_without(result: xr.DataTree | FitView, part: str) -> pd.DataFrame:
-    """The material's intervals with and without a part of the instrument."""
+    """Compare intervals of the material with and without a part of the instrument."""
     fit = view_of(result)
     without, rows = fit.scalars_of(f"without_{part}"), {}
     for scalar in fit.scalars:

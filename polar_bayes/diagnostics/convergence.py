@@ -1,4 +1,4 @@
-"""Convergence: a table of every parameter, and a verdict on the fit in sentences.
+"""Convergence: a table of every parameter, and the verdict on a fit in sentences.
 
 Source: Vehtari et al. (2021), Bayesian Analysis 16(2) (R-hat, ESS); Vehtari et al. (2024), JMLR
 25(72) (Pareto k).
@@ -36,7 +36,7 @@ COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk", "ess_tail", "mcse
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """Whether a result may be used, and what follows from it, in sentences.
+    """True if a result may be used, and what follows from it, in sentences.
 
     Args:
         passed: False where the numbers must not be used.
@@ -64,7 +64,7 @@ class Verdict:
 
     @property
     def nothing_against(self) -> str:
-        """What was checked, of a fit without problem and caution; empty of any other."""
+        """Checks made of a fit without problems and cautions; empty for any other fit."""
         if not self.passed or self.cautions or not self.checked:
             return ""
         left = f" Not computed: {', '.join(self.not_checked)}." if self.not_checked else ""
@@ -74,7 +74,7 @@ class Verdict:
 
 @once
 def summary(fit: FitView) -> pd.DataFrame:
-    """One row per scalar parameter of a fit, as `polar_bayes.summary` returns it."""
+    """Return one row per scalar parameter of a fit, as `polar_bayes.summary` does."""
     # Source: Vehtari et al. (2021), Bayesian Analysis 16(2): rank-normalized split R-hat and ESS.
     rows = _point_rows(fit) if fit.method == "point" else _draw_rows(fit.scalars)
     return pd.DataFrame(rows, columns=list(COLUMNS), index=pd.Index([s.label for s in fit.scalars]))
@@ -82,7 +82,7 @@ def summary(fit: FitView) -> pd.DataFrame:
 
 @once
 def verdict(fit: FitView) -> Verdict:
-    """Whether the numbers of a fit may be used."""
+    """Judge whether the numbers of a fit may be used."""
     method, provenance, criticism = fit.method, fit.provenance, criticize(fit)
     noted = (str(problem).rstrip(".") for problem in provenance.get("problems", ()))
     problems = [f"{text[:1].upper()}{text[1:]}." for text in noted]
@@ -123,7 +123,7 @@ def verdict(fit: FitView) -> Verdict:
 
 
 def json_summary(result: xr.DataTree | FitView) -> dict[str, Any]:
-    """Table and verdict as JSON can hold them; NaN becomes None.
+    """Return table and verdict in the types of JSON; NaN becomes None.
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
@@ -160,13 +160,13 @@ def json_summary(result: xr.DataTree | FitView) -> dict[str, Any]:
 
 
 def laplace_pareto_k(result: xr.DataTree | FitView) -> float:
-    """Pareto k of the importance weights of Laplace draws or of a variational guide."""
+    """Return Pareto k of the weights of Laplace draws, or of a variational guide's."""
     return _smoothed_weights(result)[1]
 
 
 @once
 def _smoothed_weights(fit: FitView) -> tuple[np.ndarray, float]:
-    """Pareto-smoothed weights of the draws, and Pareto k; none and NaN without weights."""
+    """Return smoothed weights of draws, and Pareto k; None and NaN without weights."""
     # $$ w = p(z | data) / q(z) $$
     # Source: Vehtari et al. (2024), JMLR 25(72).
     if "log_weight" not in fit.stats:
@@ -217,7 +217,7 @@ def _point_rows(fit: FitView) -> np.ndarray:
 
 
 def _draw_problems(fit: FitView) -> Iterator[str]:
-    """Draws that are not finite, out of range, or all equal."""
+    """List draws that are not finite, out of range, or all equal."""
     found, provenance = fit.scalars, fit.provenance
     if infinite := _percentages((s.label, ~np.isfinite(s.draws)) for s in found):
         hint = {
@@ -242,7 +242,7 @@ def _draw_problems(fit: FitView) -> Iterator[str]:
 
 
 def _out_of_range(scalar: Scalar, provenance: Provenance) -> tuple[str, np.ndarray]:
-    """Finite draws outside the prior, or outside the physical range of the parameter."""
+    """Return finite draws outside the prior or the physical range of their parameter."""
     least, most = RANGES.get(scalar.name, (-math.inf, math.inf))
     low, high = bounds_of(provenance, scalar.name)
     ends = np.array([max(low, least), min(high, most)])
@@ -253,12 +253,12 @@ def _out_of_range(scalar: Scalar, provenance: Provenance) -> tuple[str, np.ndarr
 
 
 def _percentages(flags: Iterable[tuple[str, np.ndarray]]) -> str:
-    """`roughness 3% of its draws` of each parameter that has flagged draws; empty without any."""
+    """Format `roughness 3% of its draws` for parameters with flagged draws; else empty."""
     return listed(f"{label} {bad.mean():.0%} of its draws" for label, bad in flags if bad.any())
 
 
 def _chain_problems(fit: FitView) -> Iterator[str]:
-    """Chains that disagree, are too short, or have diverged."""
+    """List chains that disagree, are too short, or have diverged."""
     table = summary(fit)
     r_hat = table["r_hat"]
     high = r_hat[~(r_hat <= LARGEST_R_HAT)].sort_values(ascending=False)
@@ -289,7 +289,7 @@ def _chain_problems(fit: FitView) -> Iterator[str]:
 
 
 def _weight_problems(fit: FitView) -> Iterator[str]:
-    """Weighted draws that are worth fewer independent ones than chains must have."""
+    """List weighted draws whose effective sample size is below the limit of chains."""
     effective = fit.provenance.get("ess")
     if fit.method in WEIGHTED and effective is not None and effective < SMALLEST_ESS:
         yield (
@@ -316,7 +316,7 @@ def _approximation_cautions(fit: FitView) -> Iterator[str]:
 
 
 def _corrections(weights: np.ndarray, found: Sequence[Scalar]) -> Iterator[str]:
-    """Means and sds of an approximation that its own smoothed weights change."""
+    """List means and sds of an approximation that its smoothed weights change."""
     changes = []
     for scalar in found:
         draws = scalar.draws.ravel()
@@ -332,7 +332,7 @@ def _corrections(weights: np.ndarray, found: Sequence[Scalar]) -> Iterator[str]:
     if changes:
         names = listed(text for _, text in sorted(changes, reverse=True))
         yield (
-            f"By its own weighted draws the approximation is off: {names}; use "
+            f"Importance weights correct the approximation: {names}; use "
             "method='importance' or 'nuts' where that matters."
         )
 
@@ -358,7 +358,7 @@ def _mode_cautions(provenance: Provenance) -> Iterator[str]:
 
 
 def _tail_cautions(fit: FitView) -> Iterator[str]:
-    """Tails of chains that are too light by weighted draws, which reach what chains may miss."""
+    """List tails of chains that are too light compared with those of weighted draws."""
     tails = fit.provenance.get("tails") or {}
     if not tails or not tails["pareto_k"] <= MAX_PARETO_K:
         return
@@ -380,12 +380,12 @@ def _tail_cautions(fit: FitView) -> Iterator[str]:
 
 
 def _chain_notes(fit: FitView) -> Iterator[str]:
-    """Trajectories that were cut short, which costs time and biases nothing."""
+    """Note trajectories that reached the depth limit, which costs time but no accuracy."""
     deep = fit.stats.get("reached_max_treedepth")
     if deep is not None and deep.sum() > LIMITS.deep_trees * deep.size:
         yield (
-            f"{int(deep.sum())} of {deep.size} draws reached the largest tree depth: steps were "
-            "cut short, which biases nothing but makes draws alike; raise it, as in "
+            f"{int(deep.sum())} of {deep.size} draws reached the largest tree depth: "
+            "trajectories were cut short, which correlates draws without bias; raise it, as in "
             "Nuts(max_tree_depth=10)."
         )
 
@@ -396,7 +396,7 @@ def _estimate_cautions(fit: FitView) -> Iterator[str]:
     if fit.method == "point" and len(undetermined):
         yield (
             f"No standard error: {listed(dict.fromkeys(undetermined))}; least squares does not "
-            "determine such values, so they say nothing."
+            "determine such values, so do not use them."
         )
 
 
@@ -423,7 +423,7 @@ def _edges(counts: Provenance, *, many: bool) -> Iterator[str]:
 
 
 def setup_cautions(provenance: Provenance) -> tuple[str, ...]:
-    """A caution where nobody stated the set-up of a capture, whatever was made of it."""
+    """Caution if no set-up was stated for a capture, however the capture was made."""
     if provenance.get("scene_chosen_by") != "default":
         return ()
     sentence = (

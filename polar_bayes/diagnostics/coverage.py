@@ -1,4 +1,4 @@
-"""How often do the intervals of a map hold the truth?"""
+"""Coverage of a map: how often its intervals contain the truth."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,13 +14,13 @@ from polar_bayes.inference.batching import IMAGE, Status, cut
 from polar_bayes.maps.lazy import CHUNK, ensure_loaded, map_parameters
 
 INTERVALS = {50: (0.25, 0.75), 80: (0.1, 0.9), 95: (0.025, 0.975)}
-"""Percent, and the levels of both ends."""
+"""Intervals by percent, with the quantile levels of both ends."""
 
 CASES = ("unknown", "masked", "unanswered", "answered")
 
 
 def coverage_columns(held: Mapping[int, int], count: int) -> dict[str, float]:
-    """Share of `count` intervals that hold the truth, by percent, with its 95% interval."""
+    """Return coverage by percent among `count` intervals, with its 95% interval."""
     # Source: Wilson (1927), JASA 22(158), 209-212.
     columns: dict[str, float] = {}
     for percent, hits in held.items():
@@ -34,7 +34,7 @@ def coverage_columns(held: Mapping[int, int], count: int) -> dict[str, float]:
 
 
 def map_coverage(maps: xr.Dataset, truth: xr.Dataset) -> pd.DataFrame:
-    """How often the intervals of a map hold the truth.
+    """Count how often the intervals of a map contain the truth.
 
     A pixel has an answer where its status is good. Of those whose truth is known, the share is
     counted whose central 50, 80 and 95% interval holds it, ends included, in the precision of the
@@ -68,7 +68,7 @@ def map_coverage(maps: xr.Dataset, truth: xr.Dataset) -> pd.DataFrame:
     known = {name: true for name in names if (true := _truth_of(maps, truth, name)) is not None}
     if not known:
         raise CaptureError(
-            "it knows the truth of no parameter of the map",
+            "it states the truth of no parameter of the map",
             where=_name_of(truth),
             hint=f"give a simulated capture, with one of {', '.join(sorted(names))} as `true_...`",
         )
@@ -89,7 +89,7 @@ def map_coverage(maps: xr.Dataset, truth: xr.Dataset) -> pd.DataFrame:
 
 
 def map_scalars(maps: xr.Dataset) -> list[Scalar]:
-    """The numbers that a map has in each pixel, labeled and in the order of a fit of one."""
+    """Return the scalars that each pixel of a map has, in the order of a fit."""
     names = map_parameters(maps)
     if not names or "status" not in maps:
         raise FitError("it holds no maps", where="maps", hint="give what fit_pixels returns")
@@ -98,7 +98,7 @@ def map_scalars(maps: xr.Dataset) -> list[Scalar]:
 
 
 def _truth_of(maps: xr.Dataset, truth: xr.Dataset, name: str) -> xr.DataArray | None:
-    """The truth of a parameter, where it is known over its own axes or fewer."""
+    """Return the truth of a parameter, which may have fewer axes than the parameter."""
     true, mean = truth.get(f"true_{name}"), maps[name]
     if true is None or not set(true.dims) <= set(mean.dims):
         return None
@@ -121,7 +121,7 @@ def _name_of(truth: xr.Dataset) -> str:
 
 
 def _count(status: xr.DataArray, bounds: xr.DataArray, true: xr.DataArray) -> np.ndarray:
-    """Pixels of a block by case, then those held by each interval: (case, own axes)."""
+    """Count the pixels of a block by case, then those that each interval contains."""
     own = [dim for dim in bounds.dims if dim not in ("quantile", *IMAGE)]
     true = true.astype(bounds.dtype)
     is_known, is_masked = true.notnull(), status == Status.MASKED

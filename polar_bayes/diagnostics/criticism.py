@@ -1,4 +1,4 @@
-r"""Model criticism of one fit: what the readings say against its priors, its instrument, its parts.
+r"""Model criticism of a fit: do readings contradict its priors, its instrument or its parts?
 
 Each check has a level. A problem makes the intervals unusable, a caution stands next to them, a
 note tells what was found without speaking against anything. Residuals have their own file.
@@ -46,26 +46,26 @@ from polar_bayes.priors import INDICES
 
 INDEX = "refractive_index"
 QUESTIONS = {
-    "priors": "are the material and what carries it in the tails of their priors?",
+    "priors": "are the material and correlated parameters in the tails of their priors?",
     "absent": "is a part of the scene, or a fault of the instrument, not seen at all?",
     "noise": "do the readings scatter more, or less, than was stated?",
     "bounds": "does a parameter lie against a bound?",
     "index": "does Brewster's angle mean an index that the prior excludes?",
     "systematic errors": "does the answer rest on smooth errors that the readings do not show?",
-    "angle": "do neighboring directions err alike?",
-    "wavelength": "do the wavelengths of one view err alike?",
+    "angle": "do neighboring directions have correlated errors?",
+    "wavelength": "do the wavelengths of one view have correlated errors?",
     "outliers": "is a reading farther out than noise explains?",
     "leave-one-out": "are leave-one-out PIT values uniform?",
     "influence": "does a single reading decide the answer?",
     "repeats": "was a view entered more than once?",
     "alternatives": "would another part do as well, or better?",
 }
-"""The checks in the order of the table, and what each asks."""
+"""The checks in the order of the table, each with its question."""
 
 
 @once
 def criticize(result: xr.DataTree | FitView) -> pd.DataFrame:
-    """What the readings say against the model of a fit.
+    """Check the model of a fit against its readings.
 
     A check with a p-value gives a caution below 0.02 and a problem below 0.004, which is the
     probability of either under a right model whose truth is drawn from its priors.
@@ -124,7 +124,7 @@ def _table(findings: Mapping[str, Finding]) -> pd.DataFrame:
 
 
 def _prior_conflict(fit: FitView, is_beyond: bool) -> Finding:
-    """Posterior medians in the tails of their priors: the farthest, and all of them together."""
+    """Check posterior medians against the tails of their priors, one by one and jointly."""
     below = _prior_probability(fit, _carriers(fit.scalars))
     if not below:
         return Finding("not computed", sentence="The fit states no prior probabilities.")
@@ -149,7 +149,7 @@ def _prior_conflict(fit: FitView, is_beyond: bool) -> Finding:
 
 
 def _carriers(found: Sequence[Scalar]) -> list[Scalar]:
-    """Material parameters, and those of the scene that are correlated with one of them."""
+    """Return the material parameters, and scene parameters correlated with one of them."""
     judged = [s for s in found if s.name not in PERFECT and np.isfinite(s.draws).all()]
     material = [s for s in judged if s.is_material]
     if not material:
@@ -165,7 +165,7 @@ def _carriers(found: Sequence[Scalar]) -> list[Scalar]:
 
 
 def _absent_end(name: str, provenance: Provenance) -> float:
-    """-1 or 1 where the low or the high end of the support is where its part is absent, else 0."""
+    """Return -1 or 1 if the low or high end of the support means an absent part, else 0."""
     absent = absence(name)
     if absent is None:
         return 0.0
@@ -174,7 +174,7 @@ def _absent_end(name: str, provenance: Provenance) -> float:
 
 
 def _prior_probability(fit: FitView, found: Sequence[Scalar]) -> dict[Scalar, float]:
-    """Prior probability below the posterior median of each parameter that has a prior."""
+    """Return the prior probability below the posterior median of each parameter."""
     stated = fit.provenance.get("prior_probability") or {}
     fixed = fit.provenance.get("fixed") or {}
     return {
@@ -185,7 +185,7 @@ def _prior_probability(fit: FitView, found: Sequence[Scalar]) -> dict[Scalar, fl
 
 
 def _absent(found: Sequence[Scalar], absent: Sequence[Scalar]) -> Finding:
-    """Parts and faults at the value at which they are absent, and the answer without them."""
+    """Note parts and faults that are consistent with absence, and the answer without them."""
     others = [s for s in found if s.is_material and s not in absent and np.isfinite(s.draws).all()]
     others = [s for s in others if s.name == INDEX] or others
     words = list(dict.fromkeys(a.words for s in absent if (a := absence(s.name)) is not None))
@@ -205,7 +205,7 @@ def _absent(found: Sequence[Scalar], absent: Sequence[Scalar]) -> Finding:
 
 
 def _is_absent(scalar: Scalar, fit: FitView) -> bool:
-    """Whether the posterior lies at the absent end, and the readings have brought it there."""
+    """Return whether the readings have moved the posterior to the absent end."""
     absent, prior = absence(scalar.name), fit.prior.get(scalar.label)
     if absent is None or prior is None or not np.isfinite(scalar.draws).all():
         return False
@@ -218,7 +218,7 @@ def _is_absent(scalar: Scalar, fit: FitView) -> bool:
 
 
 def _without(scalar: Scalar, absent: Sequence[Scalar]) -> float:
-    """Change of a mean, in sds, where others are held absent; by regression on their draws."""
+    """Estimate by regression, in sds, how a mean changes if other parameters are held absent."""
     # Source: conditional mean of a normal posterior.
     values = np.stack([s.draws.ravel() for s in absent])
     ends = np.array([a.value for s in absent if (a := absence(s.name)) is not None])
@@ -229,7 +229,7 @@ def _without(scalar: Scalar, absent: Sequence[Scalar]) -> float:
 
 
 def _noise(fit: FitView) -> Finding:
-    """Scatter of the readings beyond what their priors allow, and against their stated errors."""
+    """Check the scatter of readings against the noise priors and the stated errors."""
     noise = [s for s in fit.scalars if s.name in PERFECT and np.isfinite(s.draws).all()]
     below = _prior_probability(fit, noise)
     worse = {
@@ -264,7 +264,7 @@ def _noise(fit: FitView) -> Finding:
 
 
 def _bounds(fit: FitView, is_beyond: bool) -> Finding:
-    """Posterior density at a bound of the support that is as high as inside, unlike the prior's."""
+    """Find bounds of the support where the posterior density, unlike the prior's, is high."""
     hits = []
     for scalar in fit.scalars:
         prior = fit.prior.get(scalar.label)
@@ -294,7 +294,7 @@ def _bounds(fit: FitView, is_beyond: bool) -> Finding:
 
 
 def _index(fit: FitView) -> Finding:
-    """Brewster's angle by eye, where it means an index that the prior of the fit excludes."""
+    """Check the index of Brewster's angle by eye against the prior of the fit."""
     provenance = fit.provenance
     stated = provenance.get("indices_by_eye") or {}
     by_eye: dict[str, IndexByEye | None] = {n: IndexByEye(*index) for n, index in stated.items()}
@@ -313,7 +313,7 @@ def _index(fit: FitView) -> Finding:
 
 
 def _share_at(bound: float, draws: np.ndarray) -> float:
-    """Share of draws in a strip at a bound, whose width is a share of that of their interval."""
+    """Return the share of draws in a strip at a bound, its width a share of their interval."""
     strip = NEAR_BOUND * float(np.diff(np.quantile(draws, CENTRAL_95))[0])
     return float(np.mean(np.abs(draws - bound) < strip))
 
@@ -322,7 +322,7 @@ def _share_at(bound: float, draws: np.ndarray) -> float:
 
 
 def _systematic_errors(fit: FitView, absent: Sequence[Scalar]) -> Finding:
-    """Smooth errors that are larger than their prior, or that alone move the answer."""
+    """Find smooth errors that exceed their prior, or that alone move the answer."""
     found, groups = fit.scalars, fit.result.children
     amplitude = [s for s in found if s.name == "discrepancy_amplitude"]
     if not amplitude:
@@ -330,7 +330,7 @@ def _systematic_errors(fit: FitView, absent: Sequence[Scalar]) -> Finding:
     if "scenes" in groups:  # those without smooth errors are among the scenes compared
         return Finding("passed")
     if "without_discrepancy" not in groups:
-        reason = "Nothing is known of the answer without smooth errors, which was not fitted."
+        reason = "The fit without smooth errors was not made."
         return Finding("not computed", sentence=reason)
     sizes = [*amplitude, *(s for s in found if s.name == NOISE_FACTOR)]
     below = _prior_probability(fit, sizes)
@@ -361,7 +361,7 @@ def _systematic_errors(fit: FitView, absent: Sequence[Scalar]) -> Finding:
 
 
 def _is_needed(fit: FitView, amplitude: Scalar) -> bool:
-    """Whether the readings speak strongly against an amplitude near zero."""
+    """Return whether the readings strongly contradict an amplitude near zero."""
     # The Savage-Dickey ratio of densities at zero, each as the share near it.
     prior = fit.prior.get(amplitude.label)
     if prior is None:
@@ -374,7 +374,7 @@ def _is_needed(fit: FitView, amplitude: Scalar) -> bool:
 
 
 def _leave_one_out(checks: Mapping[str, PredictiveCheck]) -> Finding:
-    """Uniformity of the leave-one-out PIT values of each variable."""
+    """Test the leave-one-out PIT values of each variable for uniformity."""
     pits = {name: check.loo.pit for name, check in checks.items() if check.loo is not None}
     if not pits:
         return Finding("not computed", sentence="The fit holds no log likelihoods.")
@@ -402,7 +402,7 @@ def _uniformity(pit: np.ndarray) -> float:
 
 
 def _repeats(fit: FitView) -> Finding:
-    """Views that repeat another in its directions and in every digit of its readings."""
+    """Find views that repeat another one's directions, and every digit of its readings."""
     observed = fit.result["observed_data"].to_dataset()
     constants = fit.result["constant_data"].to_dataset()
     columns = [
@@ -432,7 +432,7 @@ def _repeats(fit: FitView) -> Finding:
 
 
 def _alternatives(fit: FitView, absent: Sequence[Scalar]) -> Finding:
-    """Parts that explain the readings better, or as well with another answer."""
+    """Find parts that explain the readings better, or as well with another answer."""
     try:
         table = alternatives(fit)
     except FitError as error:
@@ -484,12 +484,12 @@ def _alternatives(fit: FitView, absent: Sequence[Scalar]) -> Finding:
 
 
 def _swap_text(alternative: str, part: str) -> str:
-    """`GGX in the place of Beckmann`, `a water film`."""
+    """Format an alternative as `GGX in the place of Beckmann` or `a water film`."""
     return f"a {alternative}" if part == NOTHING else f"{alternative} in the place of {part}"
 
 
 def _without_idle(table: pd.DataFrame, absent: Sequence[Scalar]) -> pd.DataFrame:
-    """Alternatives but those to a part that sends nothing, where all else is the same with them.
+    """Leave out alternatives to a part that sends no light and changes nothing else.
 
     No reading tells one body that is not there from another: their Bayes factor is that of priors.
     """

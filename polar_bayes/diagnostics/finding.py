@@ -1,4 +1,4 @@
-"""The outcome of one check of a model, and the words that all of them share."""
+"""The outcome of one check of a model, and texts that all checks share."""
 
 import dataclasses
 import math
@@ -23,7 +23,7 @@ LEVELS = ("passed", "note", "caution", "problem")
 def judged_by(
     p_value: float, statistic: float, sentence: str, *, least: str = "passed", most: str = "problem"
 ) -> Finding:
-    """The outcome of a check with a p-value, from the level `least` to the level `most`."""
+    """Return the outcome of a check with a p-value: a problem, a caution, or passed."""
     found = level(p_value)
     if found in LEVELS:
         found = max(min(found, most, key=LEVELS.index), least, key=LEVELS.index)
@@ -31,17 +31,17 @@ def judged_by(
 
 
 def p_text(p_value: float) -> str:
-    """`p = 0.012`."""
+    """Format a p-value as `p = 0.012`."""
     return "p < 1e-6" if p_value < 1e-6 else f"p = {p_value:.2g}"
 
 
 def join(names: Sequence[str]) -> str:
-    """`a, b and c`."""
+    """Join texts as `a, b and c`."""
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
 def listed(items: Iterable[str], most: int = 4) -> str:
-    """The first items, and how many more there are: `roughness 1.08, exposure 1.03 and 2 more`."""
+    """List the first items and count the others: `roughness 1.08, exposure 1.03 and 2 more`."""
     items = list(items)
     more = len(items) - most
     return ", ".join(items[:most]) + (f" and {more} more" if more > 0 else "")

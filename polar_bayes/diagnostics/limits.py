@@ -1,4 +1,4 @@
-"""Every limit by which a fit alone is judged, in one table.
+"""Limits of the checks of a single fit, in one table.
 
 Those by which the pixels of a map are judged as well are in `polar_bayes.inference.checks`.
 """
@@ -9,7 +9,7 @@ import math
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """Limits of the checks, in posterior sds where nothing else is said."""
+    """Limits of the checks, in posterior sds unless a comment says otherwise."""
 
     # Prior probability beyond the posterior median of one parameter that is stated.
     prior_tail: float = 0.01

@@ -14,14 +14,14 @@ from polar_bayes.physics.scene import MATERIAL_PARAMETERS
 
 SAMPLE_DIMS = ("chain", "draw")
 MIN_DRAWS = 100
-"""Draws of which fewer say too little to check predictions or weigh again."""
+"""Fewest draws from which predictions are checked or weights are computed."""
 
 APPROXIMATIONS = ("laplace", "variational")
-"""Methods whose draws are of the approximation, stored with `log_weight`: log posterior minus log
+"""Methods that draw from an approximation and store `log_weight`: log posterior minus log
 approximation, up to a constant."""
 
 WEIGHTED = ("importance",)
-"""Methods whose draws were resampled from weighted ones."""
+"""Methods whose draws are resampled from weighted draws."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class Scalar:
 def with_entries[T](
     found: Iterable[Scalar], stated: Mapping[str, Iterable[T]]
 ) -> Iterator[tuple[Scalar, T]]:
-    """Each scalar with its entry of what the provenance states by name, where it has one."""
+    """Pair each scalar with its entry in a provenance mapping by name, where it has one."""
     entries = {name: iter(values) for name, values in stated.items()}
     for scalar in found:
         for entry in itertools.islice(entries.get(scalar.name, iter(())), 1):
@@ -51,13 +51,13 @@ def with_entries[T](
 
 
 def is_hyperparameter(name: str, names: Collection[str]) -> bool:
-    """True for what describes a population, or a process over wavelength, of another parameter."""
+    """Return True for parameters of a population or of a process over wavelength."""
     ends = ("_location", "_spread", "_level", "_amplitude", "_length")
     return any(name.endswith(end) and name.removesuffix(end) in names for end in ends)
 
 
 def scalars(group: xr.Dataset, sample_dims: Sequence[str] = SAMPLE_DIMS) -> list[Scalar]:
-    """Every scalar of a group of draws, whose leading axes are the sample dims."""
+    """List every scalar of a group of draws, whose leading axes are the sample dims."""
     names = set(map(str, group.data_vars))
     ordered = sorted(group.data_vars, key=lambda name: _rank(str(name), group[name], names))
     found = [scalar for name in ordered for scalar in _entries(group[name], sample_dims)]
@@ -96,7 +96,7 @@ def _entries(variable: xr.DataArray, sample_dims: Sequence[str]) -> Iterator[Sca
 
 
 def _coordinate(variable: xr.DataArray, dim: str) -> list[str]:
-    """Labels of one axis as text: 450 rather than 450.0."""
+    """Format the labels of one axis as text: 450 rather than 450.0."""
     values = variable[dim].to_numpy() if dim in variable.coords else np.arange(variable.sizes[dim])
     return [
         repr(float(value)).removesuffix(".0")
@@ -111,7 +111,7 @@ def _coordinate(variable: xr.DataArray, dim: str) -> list[str]:
 
 @dataclasses.dataclass(frozen=True, order=True)
 class Coordinate:
-    """One unconstrained coordinate: its label in tables, its site, and its number in the site.
+    """One unconstrained coordinate: its label in tables, its site, and its index in the site.
 
     `is_entry` is False where the site has fewer coordinates than numbers, such as a simplex.
     """
@@ -124,7 +124,7 @@ class Coordinate:
 
 
 def label_coordinates(program: Program, capture: xr.Dataset) -> list[Coordinate]:
-    """All unconstrained coordinates in their order."""
+    """Label all unconstrained coordinates in their order."""
     found = []
     for site, positions in program.positions.items():
         flat = positions.ravel()
@@ -139,7 +139,7 @@ def label_coordinates(program: Program, capture: xr.Dataset) -> list[Coordinate]
 
 
 def label_scalars(program: Program, capture: xr.Dataset, draws: Values) -> list[Scalar]:
-    """Scalars of chains of draws, with the capture's own labels of axes, such as wavelengths."""
+    """Label scalars of chains of draws by the capture's own labels, such as wavelengths."""
     group = posterior_of(program, draws)
     labels = {str(dim): capture[dim] for dim in group.dims if dim in capture.coords}
     return scalars(group.assign_coords(labels))

@@ -1,4 +1,4 @@
-"""Populations of a hierarchical fit: their summaries, and the shrinkage of each member.
+"""Populations of a hierarchical fit: summaries, and shrinkage of each member.
 
 A parameter is pooled where the posterior also holds `<parameter>_location` and
 `<parameter>_spread`. The population is normal on the parameter's own scale: log for positive
@@ -33,7 +33,7 @@ MEMBER_COLUMNS = (
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Population:
-    """One pooled parameter, at one wavelength where it has several."""
+    """The population of one parameter, at one wavelength where it has several."""
 
     label: str
     location: Scalar
@@ -44,12 +44,12 @@ class Population:
 
     @property
     def name(self) -> str:
-        """The pooled parameter."""
+        """Name of the pooled parameter."""
         return self.members[0].name
 
     @property
     def scale(self) -> str:
-        """Where the population is normal: "log", "log odds" or "plain"."""
+        """Scale on which the population is normal: "log", "log odds" or "plain"."""
         limits = RANGES.get(self.name, (-math.inf, math.inf))
         return {(0.0, math.inf): "log", (0.0, 1.0): "log odds"}.get(limits, "plain")
 
@@ -65,7 +65,7 @@ class Population:
         return scales[self.scale](value)
 
     def differences(self) -> np.ndarray:
-        """Draws of the spread in the unit of the parameter; a factor on the log scale."""
+        """Return draws of the spread in the parameter's unit; a factor on the log scale."""
         location, spread = self.location.draws.ravel(), self.spread.draws.ravel()
         if self.scale == "log":
             with np.errstate(over="ignore"):
@@ -74,7 +74,7 @@ class Population:
         return location * (1.0 - location) * spread if self.scale == "log odds" else spread
 
     def new_members(self, count: int = 20_000, seed: int = 0) -> np.ndarray:
-        """Draws of members that were not measured, shape (count,), unit of the parameter."""
+        """Draw the parameter of members that were not measured, (count,)."""
         location, spread = self.location.draws.ravel(), self.spread.draws.ravel()
         # Evenly through the draws; as many ranks of the population as there are draws of it.
         at = np.linspace(0, location.size - 1, count).round().astype(int)
@@ -90,7 +90,7 @@ class Population:
 
 @once
 def populations(fit: FitView) -> list[Population]:
-    """Every pooled parameter of a fit, wavelength by wavelength; none of a point fit."""
+    """List every pooled parameter of a fit, by wavelength; empty for a point fit."""
     found: dict[str, list[Scalar]] = {}
     for scalar in [] if fit.method == "point" else fit.scalars:
         found.setdefault(scalar.name, []).append(scalar)
@@ -104,7 +104,7 @@ def populations(fit: FitView) -> list[Population]:
 
 @once
 def population_summary(result: xr.DataTree | FitView) -> pd.DataFrame:
-    r"""How much the members of each population differ, and where a new one would lie.
+    r"""Summarize how much members of each population differ, and predict a new member.
 
     The location is the population's median in the unit of the parameter, the spread the standard
     deviation between members on the scale on which the population is normal. `between` is what it
@@ -156,7 +156,7 @@ def _of_parameter(
 
 
 def _is_finite(population: Population) -> bool:
-    """True where every draw is finite, also on the population's scale."""
+    """Return whether every draw is finite, also on the population's scale."""
     on_scale = (population.to_scale(s.draws) for s in (population.location, *population.members))
     return all(bool(np.isfinite(draws).all()) for draws in (population.spread.draws, *on_scale))
 
@@ -193,7 +193,7 @@ def _pooling_factor(population: Population) -> float:
 
 @once
 def shrinkage(fit: FitView) -> pd.DataFrame:
-    """Each member's pooled and unpooled estimate, and how far the population shrinks it."""
+    """Return each member's pooled and unpooled estimate, and its shrinkage."""
     # The unpooled estimate is not a further fit: the population is divided out of the draws. If the
     # likelihood of a member is that of $x_m \sim Normal(a, 1/p)$ on the population's scale, its
     # posterior given the population is
@@ -221,7 +221,7 @@ def shrinkage(fit: FitView) -> pd.DataFrame:
 
 
 class UnpooledEstimate(NamedTuple):
-    """One member without its population, on the scale on which the population is normal.
+    """Estimate of one member without its population, on the population's normal scale.
 
     The shrinkage is the weight of the population in the member's posterior mean.
     """
@@ -268,7 +268,7 @@ def unpooled_estimate(
 
 
 def _log_density(x: np.ndarray, mu: np.ndarray, precision: np.ndarray, b: float, p: float) -> float:
-    """Of all draws, up to a constant."""
+    """Return the log density of all draws, up to a constant."""
     variance = 1.0 / (p + precision)
     mean = variance * (b + mu * precision)
     return float(np.sum(-0.5 * (x - mean) ** 2 / variance - 0.5 * np.log(variance)))
@@ -277,7 +277,7 @@ def _log_density(x: np.ndarray, mu: np.ndarray, precision: np.ndarray, b: float,
 def _derivatives(
     x: np.ndarray, mu: np.ndarray, precision: np.ndarray, b: float, p: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Gradient of the log density in (b, p), and minus its second derivatives."""
+    """Return the gradient of the log density in (b, p), and minus its Hessian."""
     variance = 1.0 / (p + precision)
     mean = variance * (b + mu * precision)
     gradient = np.array([np.sum(x - mean), 0.5 * np.sum(mean**2 + variance - x**2)])

@@ -40,13 +40,13 @@ class Loo:
 
     @property
     def unreliable(self) -> int:
-        """How many readings have a Pareto k above 0.7."""
+        """Number of readings with a Pareto k above 0.7."""
         return int(np.sum(~(self.pareto_k <= MAX_PARETO_K)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PredictiveCheck:
-    """How one recorded variable compares with its prediction."""
+    """Comparison of one recorded variable with its prediction."""
 
     name: str
     count: int
@@ -83,7 +83,7 @@ def pit_band(pit: np.ndarray, most: int = 500) -> xr.Dataset | None:
 
 @functools.lru_cache(maxsize=64)
 def _uniform_band(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points and edges of the band, which depend on the number of values only."""
+    """Return points and edges of the band, which depend on the number of values only."""
     values, random = np.linspace(0.0, 1.0, size), np.random.default_rng(214)
     at, _, lower, upper = ecdf_pit(values, ci_prob=0.95, n_simulations=1000, rng=random)
     return at, lower, upper
@@ -106,7 +106,7 @@ def usable_readings(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FlatVariable:
-    """One variable with its readings flattened into one axis."""
+    """One variable, its readings flattened into one axis."""
 
     name: str
     usable: np.ndarray  # bool, in the shape of the readings
@@ -137,7 +137,7 @@ def _select(result: xr.DataTree, name: str) -> FlatVariable | None:
 
 @once
 def flat_variables(fit: FitView) -> list[FlatVariable]:
-    """The recorded variables that a fit predicts and that have readings."""
+    """Return the recorded variables that have readings and predictions."""
     result = fit.result
     names = result["observed_data"].data_vars if "observed_data" in result.children else ()
     found = (_select(result, str(name)) for name in names)
@@ -160,7 +160,7 @@ def _check(
 
 
 def _pit(variable: FlatVariable, weights: np.ndarray) -> np.ndarray:
-    """Weighted share of the predicted readings below each reading, ties broken at random."""
+    """Return the weighted share of predictions below each reading, ties broken at random."""
     weights = np.where(variable.predicted < variable.full_scale, weights, 0.0)
     below = np.sum(weights * (variable.predicted < variable.observed), axis=0)
     tied = np.sum(weights * (variable.predicted == variable.observed), axis=0)
@@ -194,7 +194,7 @@ def _loo(variable: FlatVariable, relative_ess: float, correction: np.ndarray | N
 
 
 def _relative_ess(fit: FitView) -> float:
-    """Effective over actual draws, averaged over the parameters; 1 for independent draws."""
+    """Return effective over actual draws, averaged over parameters; 1 if independent."""
     if fit.method != "nuts":
         return 1.0
     draws = np.stack([s.draws for s in fit.scalars])
@@ -205,7 +205,7 @@ def _relative_ess(fit: FitView) -> float:
 
 
 def _correction(fit: FitView) -> np.ndarray | None:
-    """Log weights that turn draws of an approximation into posterior draws, where stored."""
+    """Return log weights that turn draws of an approximation into posterior draws."""
     if "log_weight" not in fit.stats or fit.method not in APPROXIMATIONS:
         return None
     log_weight = fit.stats["log_weight"].to_numpy().astype(float).ravel()

@@ -1,4 +1,4 @@
-r"""Residuals of the readings of a fit: structure, outliers, and readings that decide the answer.
+r"""Residuals of a fit: structure, outliers, and readings that determine the answer.
 
 The residuals of the readings are compared with residuals of replicated readings. A replicate is
 drawn from the posterior predictive distribution, and refitted in the linear-Gaussian approximation:
@@ -37,7 +37,7 @@ from polar_bayes.physics.geometry import unit_vectors
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Residuals:
-    """Standardized residuals of the readings and of replicates, with where each was read."""
+    """Standardized residuals of readings and replicates, with their positions."""
 
     observed: np.ndarray  # (reading,)
     replicated: np.ndarray  # (replicate, reading)
@@ -53,7 +53,7 @@ class Residuals:
 
 @once
 def residuals_of(fit: FitView) -> Residuals | None:
-    """Residuals of all variables together, since they share the parameters that absorb them."""
+    """Compute residuals of all variables together, since they share their parameters."""
     result, variables = fit.result, flat_variables(fit)
     constants = result.children.get("constant_data", xr.DataTree()).data_vars
     if not all(name in constants for name in ANGLES):
@@ -124,7 +124,7 @@ def _readings(result: xr.DataTree, variable: FlatVariable) -> pd.DataFrame:
 
 
 def residual_findings(residuals: Residuals | None) -> dict[str, Finding]:
-    """The checks of residuals by name."""
+    """Run the checks of residuals, and return them by name."""
     checks = {
         "angle": _angle,
         "wavelength": _wavelength,
@@ -138,7 +138,7 @@ def residual_findings(residuals: Residuals | None) -> dict[str, Finding]:
 
 
 def _angle(residuals: Residuals) -> Finding:
-    """Neighbors with residuals of one sign, where a coordinate and a scale show it most."""
+    """Test for neighboring views with residuals of one sign, on several scales."""
     view, light = (unit_vectors(residuals.directions[:, at]) for at in ([0, 1], [2, 3]))
     half = (view + light) / np.maximum(np.linalg.norm(view + light, axis=1, keepdims=True), 1e-9)
     # A wrong microfacet distribution errs by the tilt of the half vector, a wrong reflectance by
@@ -167,7 +167,7 @@ def _angle(residuals: Residuals) -> Finding:
 
 
 def _wavelength(residuals: Residuals) -> Finding:
-    """Readings of one view that err alike, or with opposite signs, in several wavelengths."""
+    """Test for readings of one view with correlated residuals in several wavelengths."""
     if len(np.unique(residuals.wavelength)) < 2:
         return Finding("passed")
     view = np.unique(residuals.directions, axis=0, return_inverse=True)[1].ravel()
@@ -183,7 +183,7 @@ def _wavelength(residuals: Residuals) -> Finding:
 
 
 def _autocorrelation(residuals: Residuals, kernels: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Moran's I for each kernel, standardized by the replicates; the largest and its p-value."""
+    """Return the largest Moran's I, standardized by replicates, and its p-value."""
     scores, null = [], []
     for kernel in kernels:
         kernel = kernel - np.diag(np.diag(kernel))
@@ -200,7 +200,7 @@ def _autocorrelation(residuals: Residuals, kernels: Sequence[np.ndarray]) -> tup
 
 
 def _p_value(observed: float, replicates: np.ndarray) -> float:
-    """Share of the replicates, the readings among them, whose statistic is as large."""
+    """Return the share of replicates, and the readings, whose statistic is as large."""
     return float((1 + np.sum(replicates >= observed)) / (1 + replicates.size))
 
 
@@ -209,7 +209,7 @@ def _moran(e: np.ndarray, kernel: np.ndarray) -> np.ndarray:
 
 
 def _outliers(residuals: Residuals) -> Finding:
-    """The largest residual in units of their root mean square."""
+    """Test the largest residual in units of their root mean square."""
 
     def largest(e: np.ndarray) -> np.ndarray:
         return np.abs(e).max(axis=-1) / np.sqrt(np.mean(e**2, axis=-1))
@@ -231,14 +231,14 @@ def _outliers(residuals: Residuals) -> Finding:
 
 
 def _influence(residuals: Residuals) -> Finding:
-    """Readings that move a parameter, and that the others contradict."""
+    """Find readings that move a parameter and that the other readings contradict."""
     if not residuals.parameters:
         return Finding("passed")
     left_out = residuals.left_out
     gain = np.abs(residuals.gains).max(axis=0) / left_out
 
     def contradiction(e: np.ndarray) -> np.ndarray:
-        """Residuals without the reading itself, in their own sd, where it moves the answer."""
+        """Return leave-one-out residuals, in their sd, of readings that move the answer."""
         moves = (gain * np.abs(e) > LIMITS.large_shift) & (left_out > LIMITS.known_too)
         return np.where(moves, np.abs(e) / np.sqrt(left_out), 0.0)
 
@@ -259,7 +259,7 @@ def _influence(residuals: Residuals) -> Finding:
 
 
 def readings_alone(residuals: Residuals | None) -> dict[str, tuple[str, float]]:
-    """By parameter: the reading without which its sd would at least double, and by what factor."""
+    """Find, by parameter, the reading without which its sd would at least double."""
     if residuals is None or not residuals.parameters:
         return {}
     widened = np.sqrt(1.0 + residuals.gains**2 / residuals.left_out)

@@ -35,7 +35,7 @@ COLUMNS = (
 
 @once
 def sensitivity(fit: FitView) -> pd.DataFrame:
-    """How much the data and the prior determine each parameter; empty for a point fit."""
+    """Return how much data and prior determine each parameter; empty for a point fit."""
     if fit.method == "point":
         return pd.DataFrame(columns=list(COLUMNS))
     groups = ("log_prior", "log_likelihood")
@@ -49,7 +49,7 @@ def sensitivity(fit: FitView) -> pd.DataFrame:
         remarks = _remarks(scalar.draws, compared, *rates)
         if scalar.label in alone:
             reading, factor = alone[scalar.label]
-            remarks.append(f"rests on {reading}: {factor:.1f} times as wide without it")
+            remarks.append(f"depends on {reading}: {factor:.1f} times as wide without it")
         rows.append([*compared, *rates, "; ".join(remarks)])
     index = pd.Index([scalar.label for scalar in fit.scalars])
     return pd.DataFrame(rows, columns=list(COLUMNS), index=index)
@@ -80,7 +80,7 @@ def _interval(draws: np.ndarray) -> tuple[float, float]:
 def total_density(
     result: xr.DataTree, group: str, without: Collection[str] = ()
 ) -> np.ndarray | None:
-    """The sum of a group of log densities but for some, shape (chain, draw)."""
+    """Sum a group of log densities except for some names, (chain, draw)."""
     if group not in result.children or not result[group].data_vars:
         return None
     total: Any = 0.0
@@ -91,7 +91,7 @@ def total_density(
 
 
 def _scaled_weights(log_density: np.ndarray | None) -> list[np.ndarray] | None:
-    """Importance weights of a posterior whose density is raised to each of `POWERS`."""
+    """Return weights of a posterior whose density is raised to each of `POWERS`."""
     if log_density is None or log_density.size < MIN_DRAWS or not np.isfinite(log_density).all():
         return None
     if np.ptp(log_density) < 1e-12:
@@ -120,5 +120,5 @@ def _remarks(draws: np.ndarray, compared: list[Any], prior: float, likelihood: f
         remarks.append("outside the prior's 95%")
     if prior >= LIMITS.sensitive:
         pulled = likelihood >= LIMITS.sensitive
-        remarks.append("priors and data may pull apart" if pulled else "leans on the priors")
+        remarks.append("priors and data may conflict" if pulled else "depends on the priors")
     return remarks

@@ -1,4 +1,4 @@
-"""A fit that was checked when it entered, and what is computed of it once.
+"""A validated fit, with cached quantities.
 
 Diagnostics, figures and pages take a tree or a view of it. A tree is checked and gets a view of its
 own; whoever calls several functions makes one view with `view_of` and gives it to all of them.
@@ -19,7 +19,7 @@ from polar_bayes.inference.result import Provenance, provenance_of
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FitView:
-    """A fit that was checked; the tree must not change while the view is in use.
+    """A validated fit; the tree must not change while the view is in use.
 
     Args:
         result: The tree.
@@ -31,12 +31,12 @@ class FitView:
 
     @functools.cached_property
     def provenance(self) -> Provenance:
-        """How the fit was made; null entries are left out."""
+        """Provenance of the fit, without null entries."""
         return provenance_of(self.result)
 
     @functools.cached_property
     def posterior(self) -> xr.Dataset:
-        """The group of draws."""
+        """The group `posterior`."""
         return self.result["posterior"].to_dataset()
 
     @functools.cached_property
@@ -46,19 +46,19 @@ class FitView:
 
     @functools.cached_property
     def prior(self) -> dict[str, Scalar]:
-        """Every scalar of the draws of the prior by its label; empty where there are none."""
+        """Every scalar of the prior draws by its label; empty without prior draws."""
         return self.scalars_of("prior")
 
     @functools.cached_property
     def stats(self) -> Mapping[str, xr.DataArray]:
-        """The sampler's own statistics by name, each (chain, draw); empty where there are none."""
+        """Statistics of the sampler by name, each (chain, draw); empty without any."""
         if "sample_stats" not in self.result.children:
             return {}
         return {str(name): stat for name, stat in self.result["sample_stats"].data_vars.items()}
 
     @functools.cached_property
     def method(self) -> str:
-        """Kind of the fit's method: as recorded, or inferred from its statistics."""
+        """Kind of the fit's method, as recorded or inferred from its statistics."""
         if method := self.provenance.get("method"):
             return str(method)
         if "loss" in self.stats or self.posterior.sizes.get("draw", 0) == 1:
@@ -66,13 +66,13 @@ class FitView:
         return "nuts" if "diverging" in self.stats else "laplace"
 
     def scalars_of(self, group: str) -> dict[str, Scalar]:
-        """Every scalar of another group of draws by its label; empty where there is no such."""
+        """Return every scalar of a group of draws by its label; empty without the group."""
         if group not in self.result.children:
             return {}
         return {scalar.label: scalar for scalar in scalars(self.result[group].to_dataset())}
 
     def truth(self, scalar: Scalar) -> float:
-        """The true value of a parameter, NaN where the capture does not know it."""
+        """Return the true value of a parameter; NaN where the capture does not state it."""
         if "constant_data" not in self.result.children:
             return np.nan
         true = self.result["constant_data"].data_vars.get(f"true_{scalar.name}")
@@ -82,7 +82,7 @@ class FitView:
 
 
 def view_of(result: xr.DataTree | FitView, source: str = "result") -> FitView:
-    """A view itself, or that of a tree, which is checked; errors name the source."""
+    """Return the view of a fit after checking it; errors name the source."""
     if isinstance(result, FitView):
         return result
     check_fit(result, source)
@@ -92,7 +92,7 @@ def view_of(result: xr.DataTree | FitView, source: str = "result") -> FitView:
 def once[**P, R](
     compute: Callable[Concatenate[FitView, P], R],
 ) -> Callable[Concatenate[xr.DataTree | FitView, P], R]:
-    """Compute of a tree or a view, once for each view and further arguments."""
+    """Cache a function of a view, for each view and further arguments."""
 
     @functools.wraps(compute)
     def wrapper(result: xr.DataTree | FitView, *args: P.args, **kwargs: P.kwargs) -> R:

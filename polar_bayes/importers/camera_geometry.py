@@ -19,10 +19,10 @@ from polar_bayes.capture.schema import Interval
 from polar_bayes.errors import CaptureError
 
 ON_NORMAL = 1e-6
-"""Sine of the zenith below which a direction is that of the normal itself."""
+"""Sine of the zenith below which a direction counts as the normal itself."""
 
 EDGE_ON = 1e-9
-"""Cosine below which a surface no longer faces something; its zenith stays below 90 degrees."""
+"""Smallest cosine of a surface that faces something; its zenith stays below 90 degrees."""
 
 
 class AbstractLocation(abc.ABC):
@@ -30,7 +30,7 @@ class AbstractLocation(abc.ABC):
 
     @abc.abstractmethod
     def towards(self, points: np.ndarray) -> np.ndarray:
-        """Unit vectors from points of the surface to the location.
+        """Return unit vectors from points of the surface to the location.
 
         Args:
             points: In the camera's axes, pixels from the center of the frame, (..., 3).
@@ -121,7 +121,7 @@ class Highlight:
 
 @dataclasses.dataclass(frozen=True)
 class Surroundings:
-    """Light from everywhere: each piece of a smooth surface mirrors its surroundings.
+    """Light from everywhere: each piece of a smooth surface reflects its surroundings.
 
     No lamp need be known: the light's direction is the mirror direction of each piece, in its plane
     of incidence.
@@ -130,7 +130,7 @@ class Surroundings:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LocalGeometry:
-    """Directions in the frame of each piece of surface, and the rotation of axes; of one shape."""
+    """Directions in the frame of each piece of surface, and rotation of axes; all of one shape."""
 
     view_zenith: np.ndarray
     view_azimuth: np.ndarray
@@ -144,7 +144,7 @@ class LocalGeometry:
 
 
 def local_geometry(normals: np.ndarray, view: np.ndarray, light: np.ndarray) -> LocalGeometry:
-    """Zeniths, azimuths and the rotation of axes, from vectors in the camera's axes."""
+    """Return zeniths, azimuths and the rotation of axes, from vectors in the camera's axes."""
     outside = ~np.isfinite(normals).all(axis=-1)
     n = np.where(outside[..., None], view, normals)
     light = np.where(np.isfinite(light), light, view)
@@ -183,12 +183,12 @@ def local_geometry(normals: np.ndarray, view: np.ndarray, light: np.ndarray) -> 
 
 
 def mirror_direction(normals: np.ndarray, view: np.ndarray) -> np.ndarray:
-    """The direction from which a mirror sends light to the viewer."""
+    """Return the direction from which a mirror sends light to the viewer."""
     return 2.0 * _dot(normals, view)[..., None] * normals - view
 
 
 def as_location(location: object, where: str) -> AbstractLocation:
-    """A location from a user's argument."""
+    """Return a location from a user's argument."""
     if isinstance(location, AbstractLocation):
         return location
     if isinstance(location, list | tuple | np.ndarray) and len(location) == 3:
@@ -198,7 +198,7 @@ def as_location(location: object, where: str) -> AbstractLocation:
 
 
 def _first_axis(view: np.ndarray) -> np.ndarray:
-    """The camera's x axis, carried to a direction of view."""
+    """Rotate the camera's x axis to be perpendicular to a direction of view."""
     x, z = np.eye(3)[[0, 2]]
     return x - (view[..., :1] / (1.0 + view[..., 2:])) * (z + view)
 

@@ -1,4 +1,4 @@
-"""Columns of numbers from a text table or a sheet, read as a person would read them.
+"""Columns of numbers from a text table or a sheet, in the notations that people use.
 
 What is more than a number a cell, such as lines above the names of the columns, units below them, a
 mark for thousands or a cell without a reading, is read or left out, counted, and told in
@@ -38,7 +38,7 @@ NO_READING = frozenset(("", "-", "--", "nan", "na", "n/a", "#n/a", "none", "null
 STATISTICS = frozenset(
     "average avg count max maximum mean median min minimum n sd sem std stdev stddev sum".split()
 )
-"""Words in the place of an angle, in lower case, whose line holds no reading."""
+"""Words in the place of an angle, in lower case, that mark a line of statistics."""
 
 # A decimal comma is between digits, so the comma of "10, 5" separates.
 DIGITS = r"[+-]?(?:[0-9]+(?:\.[0-9]*|,[0-9]+)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"
@@ -52,11 +52,11 @@ THOUSANDS = {
     mark: re.compile(rf"[+-]?[1-9][0-9]{{0,2}}(?:\{mark}[0-9]{{3}})+(?:\{other}[0-9]*)?{END}")
     for mark, other in ((",", "."), (".", ","))
 }
-"""Numbers with a mark for thousands."""
+"""Patterns of numbers with thousands separators, by separator."""
 
 
 class Line(NamedTuple):
-    """A line of the file: its number, its cells, and whether it is a comment."""
+    """A line of a file: its number, its cells, and whether it is a comment."""
 
     number: int
     cells: list[str]
@@ -64,7 +64,7 @@ class Line(NamedTuple):
 
 
 class Cells(NamedTuple):
-    """The lines of a file: where errors place them, what separated cells, what was done."""
+    """The lines of a file, with its name in errors, the separator of cells, and notes."""
 
     source: str
     lines: list[Line]
@@ -96,7 +96,7 @@ class Table:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the columns; without a header line column_1, column_2, ..."""
+        """Names of the columns; column_1, column_2, ... without a header line."""
         return tuple(self.columns)
 
 
@@ -108,7 +108,7 @@ def read_table(
     wanted: Sequence[str] = (),
     kind: str | None = None,
 ) -> Table:
-    """Columns of a text table or of a sheet.
+    """Read columns from a text table or a sheet.
 
     Args:
         path: Of a text table or an .xlsx workbook. Semicolons, tabs, commas or blanks separate the
@@ -156,12 +156,12 @@ def check_column(column: str, names: Sequence[str], source: str) -> None:
 
 
 def counted(count: int, noun: str, rest: str = "") -> str:
-    """A count and what is counted, such as "2 lines of units"."""
+    """Format a count with its noun, such as "2 lines of units"."""
     return f"{count} {noun}{'' if count == 1 else 's'} {rest}".rstrip()
 
 
 def _left_out(lines: Sequence[Line], what: str) -> list[str]:
-    """That lines are left out, by their numbers; nothing where there are none."""
+    """Note which lines are left out, by their numbers; empty if none are."""
     if not lines:
         return []
     numbers = [line.number for line in lines]
@@ -183,7 +183,7 @@ def _content(file: Path) -> bytes:
 
 
 def _text_lines(file: Path, content: bytes) -> Cells:
-    """The lines of a text table that hold something."""
+    """Split a text table into lines, without blank ones."""
     notes: list[str] = []
     try:
         if content[:2] in (b"\xff\xfe", b"\xfe\xff"):  # "Unicode text" of a spreadsheet
@@ -216,7 +216,7 @@ def _text_lines(file: Path, content: bytes) -> Cells:
 
 
 def _separator(contents: list[str]) -> str:
-    """What separates cells in most lines that hold numbers alone."""
+    """Return the separator of cells in most lines that consist of numbers."""
     votes = collections.Counter(
         mark
         for content in contents[:1000]
@@ -231,7 +231,7 @@ def _separator(contents: list[str]) -> str:
 
 
 def _mark(content: str) -> str:
-    """What separates the cells of a line."""
+    """Return the separator of cells in one line."""
     for mark in ";\t":
         if mark in content:
             return mark
@@ -255,7 +255,7 @@ def _unquoted(cell: str) -> str:
 
 
 def _workbook(file: Path, content: bytes, sheet: str | None) -> Cells:
-    """The lines of one sheet of an .xlsx workbook."""
+    """Read the lines of one sheet of an .xlsx workbook."""
     try:
         openpyxl = importlib.import_module("openpyxl")
     except ImportError as error:
@@ -288,14 +288,14 @@ def _workbook(file: Path, content: bytes, sheet: str | None) -> Cells:
 
 
 def _text_of(value: object) -> str:
-    """A cell of a workbook as text; a spreadsheet computes with 15 digits."""
+    """Format a cell of a workbook; a spreadsheet computes with 15 digits."""
     if value is None:
         return ""
     return f"{value:.15g}" if isinstance(value, float) else str(value).strip()
 
 
 def _of_kind(found: Cells, kind: str | None) -> tuple[Cells, list[str]]:
-    """The lines of one kind without that word, lines without numbers, and what is left out."""
+    """Return lines of one kind (first word removed) with lines without numbers, and notes."""
     if not any(line.cells[0] == kind for line in found.lines):
         return found, []
     lines: list[Line] = []
@@ -318,7 +318,7 @@ def _of_kind(found: Cells, kind: str | None) -> tuple[Cells, list[str]]:
 def _below_names(
     lines: list[Line], wanted: Sequence[str], source: str
 ) -> tuple[list[str], list[Line], list[str]]:
-    """Names of the columns, the lines below them, and what was left out."""
+    """Return names of the columns, the lines below them, and notes of what was left out."""
     plain = [line for line in lines if not line.is_comment]
     data = [line for line in plain if _is_data(line)]
     data = data or [line for line in plain if not _is_name(next(filter(None, line.cells), ""))]
@@ -350,7 +350,7 @@ def _below_names(
 
 
 def _header(lines: list[Line], first: list[Line], width: int, wanted: Sequence[str]) -> Line | None:
-    """The line that names the columns: one that has the names wanted, or else names alone."""
+    """Return the line that names the columns: one with the names wanted, or names alone."""
     plain = [line for line in lines if not line.is_comment]
     for line in (*plain, *lines) if wanted else ():
         if set(wanted) <= set(line.cells):
@@ -367,7 +367,7 @@ def _header(lines: list[Line], first: list[Line], width: int, wanted: Sequence[s
 
 
 def _trimmed(cells: list[str]) -> list[str]:
-    """Cells without the blank ones at the end."""
+    """Remove blank cells at the end."""
     while cells and not cells[-1]:
         cells = cells[:-1]
     return cells
@@ -384,7 +384,7 @@ def _check_names(names: list[str], where: str) -> None:
 def _with_readings(
     rows: list[Line], names: list[str], key: str, source: str
 ) -> tuple[list[Line], list[str]]:
-    """Lines of as many cells as there are names, without those whose key is blank or a word."""
+    """Return lines with a cell per name, without those whose key is blank or a word."""
     k = names.index(key)
     keys = [line.cells[k].lower().rstrip(":") if len(line.cells) > k else None for line in rows]
     without = list(itertools.compress(rows, (cell in NO_READING for cell in keys)))
@@ -411,13 +411,13 @@ def _is_data(line: Line) -> bool:
 
 
 def _is_units(line: Line) -> bool:
-    """Whether a line below the names holds units: words or signs, and no digit."""
+    """Return whether a line below the names holds units: words or signs, and no digit."""
     blank = all(cell.lower() in NO_READING for cell in line.cells)
     return not blank and not any(character.isdigit() for x in line.cells for character in x)
 
 
 def _is_name(cell: str) -> bool:
-    """Whether a cell is a name rather than a mistyped number, which must not be lost."""
+    """Return whether a cell is a name rather than a mistyped number, which must be reported."""
     lettered = any(character.isalpha() for character in cell)
     is_missing = cell.lower() in {*NO_READING, "inf", "infinity"}
     return lettered and cell[0] not in "0123456789+-.," and not is_missing
@@ -431,7 +431,7 @@ def _is_blank_or_number(cell: str) -> bool:
 
 
 def _plain(cell: str) -> str:
-    """A number in plain signs; its commas and points stay what they are."""
+    """Replace typographic signs in a number; commas and points are unchanged."""
     cell = GROUPS.sub("", cell.replace("\N{MINUS SIGN}", "-"))
     return re.sub(r"(?<=[0-9.,])[dD](?=[+-]?[0-9])", "e", cell)
 
@@ -446,7 +446,7 @@ def _is_number(cell: str) -> bool:
 def _as_numbers(
     found: Cells, cells: Mapping[str, list[str]], rows: list[Line], notes: tuple[str, ...]
 ) -> Table:
-    """Columns of text as numbers."""
+    """Convert columns of text to numbers."""
     plain = {name: [_plain(cell) for cell in column] for name, column in cells.items()}
     told = collections.Counter[tuple[str, str]]()
     mark = _thousands_mark(rows, plain, found)
@@ -481,7 +481,7 @@ def _as_numbers(
 
 
 def _thousands_mark(rows: list[Line], columns: Mapping[str, list[str]], found: Cells) -> str:
-    """The mark for thousands of a table, "" where there is none."""
+    """Return the thousands separator of a table, "" without any."""
     cells = [
         (line.number, cell)
         for column in columns.values()
@@ -513,7 +513,7 @@ def _thousands_mark(rows: list[Line], columns: Mapping[str, list[str]], found: C
 
 
 def _number(text: str) -> tuple[float, float, float] | None:
-    """A cell's value, that of its last digit, and the error stated in it; None for no number."""
+    """Return value, last digit and stated error of a cell; None if it is not a number."""
     match = NUMBER.fullmatch(text) or WITH_ERROR.fullmatch(text)
     if match is None or len(text) > 64:
         return None
@@ -527,5 +527,5 @@ def _number(text: str) -> tuple[float, float, float] | None:
 
 
 def _step(digits: str) -> float:
-    """Value of the last printed digit of a number."""
+    """Return the value of the last printed digit of a number."""
     return float(f"1e{Decimal(digits).as_tuple().exponent}")

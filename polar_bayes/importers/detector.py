@@ -41,7 +41,7 @@ Frame = str | os.PathLike[str] | np.ndarray
 def read_frame(
     frame: object, where: str, transfer: str | float | None = None
 ) -> tuple[np.ndarray, float | None]:
-    """One frame of gray values, and the count of a full pixel where the format states it.
+    """Read one frame of gray values, and its full-scale count if the format states it.
 
     Raises:
         CaptureError: It is no frame, or it states a tone curve and no transfer function is given.
@@ -69,7 +69,7 @@ def read_frame(
 
 
 def read_array(path: str | os.PathLike[str], where: str) -> np.ndarray:
-    """The array of a .npy file."""
+    """Read the array of a .npy file."""
     file = existing_file(path, where)
     hint = "save one array with numpy.save"
     try:
@@ -91,7 +91,7 @@ def read_array(path: str | os.PathLike[str], where: str) -> np.ndarray:
 def read_image(
     frame: object, where: str, formats: tuple[str, ...] = ("PNG", "TIFF")
 ) -> tuple[np.ndarray, str]:
-    """The values of one channel of an image file, or of an array, and the tone curve it states."""
+    """Read one channel of an image file or array, and the tone curve that it states."""
     if not isinstance(frame, str | os.PathLike):
         return np.asarray(frame), ""
     file, gray = existing_file(frame, where), ("L", "I;16", "I;16L", "I;16B", "I", "F")
@@ -130,7 +130,7 @@ def read_image(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Detector:
-    """Camera model: how counts become light, and their noise.
+    """Camera model: the conversion from counts to light, and the noise.
 
     Args:
         saturation_level: Count at which a pixel is full, > 0; it may be left out for 8-bit frames,
@@ -183,7 +183,7 @@ class Signal:
 
 
 def signal_of(frames: Sequence[np.ndarray], level: float | None, detector: Detector) -> Signal:
-    """Light and its variance from raw frames."""
+    """Compute light and its variance from raw frames."""
     full = level if detector.saturation_level is None else detector.saturation_level
     if full is None:
         what = "the frames do not say at which count a pixel is full"
@@ -242,7 +242,7 @@ def signal_of(frames: Sequence[np.ndarray], level: float | None, detector: Detec
 
 
 def _count_step(frames: Sequence[np.ndarray]) -> int:
-    """What all counts of wide frames are multiples of, a power of two from 4 on; else 1."""
+    """Return the power of two, from 4 on, that divides all counts of wide frames; else 1."""
     values = np.unique(np.stack(frames))
     # Few different counts may have a divisor by chance, and 8 bits are not aligned.
     if values.size < 16 or values[-1] < 1024 or (values % 1.0).any():
@@ -254,7 +254,7 @@ def _count_step(frames: Sequence[np.ndarray]) -> int:
 def _flat(
     detector: Detector, shape: tuple[int, ...], linear: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
-    """Relative sensitivity of each pixel, of mean 1."""
+    """Return the relative sensitivity of each pixel, of mean 1."""
     if detector.flat is None:
         return np.ones(shape)
     values = linear(_calibration_frame(detector.flat, shape, "flat", detector))
@@ -279,7 +279,7 @@ def _calibration_frame(
 
 
 def _source(frame: Frame | float | None) -> str | float:
-    """Where a calibration frame comes from, as an attribute."""
+    """Name the source of a calibration frame, for an attribute."""
     if frame is None:
         return "none"
     if isinstance(frame, Real):
@@ -288,5 +288,5 @@ def _source(frame: Frame | float | None) -> str | float:
 
 
 def os_name(path: object) -> str:
-    """The last part of a path: what was read, without the folders of this machine."""
+    """Return the last part of a path, so that results do not contain folders of this machine."""
     return str(path).replace("\\", "/").rstrip("/").split("/")[-1]

@@ -42,13 +42,13 @@ from polar_bayes.importers.mirror import as_incidence, mirror_views
 from polar_bayes.importers.table import MUELLER, capture_of_lines
 
 PSI_ERROR, DELTA_ERROR, ELEMENT_ERROR = 0.1, 0.2, 0.005
-"""Errors where none are stated: psi and delta in degrees, and an element of a Mueller matrix."""
+"""Default errors of psi and delta in degrees, and of an element of a Mueller matrix."""
 TO_NM = {"nm": 1.0, "angstroms": 0.1, "angstrom": 0.1, "um": 1000.0, "µm": 1000.0}
 WVASE = ("wavelength", "angle", "psi", "delta", "psi_error", "delta_error")
-"""What stands in the columns of WVASE, behind the kind of a line."""
+"""Columns of WVASE files, after the kind of the line."""
 
 UNITS = {"degree": 1.0, "radian": 180.0 / math.pi}
-"""Degrees of each unit of psi and delta."""
+"""Size of each unit of psi and delta, in degrees."""
 
 Columns = str | Sequence[str]
 Given = str | float | Sequence[str] | Sequence[float] | None
@@ -70,7 +70,7 @@ def from_ellipsometer(
     angle_set_by: str = "stage",
     name: str | None = None,
 ) -> xr.Dataset:
-    """A capture from an ellipsometer; see the module.
+    """Make a capture from readings of an ellipsometer; see the module.
 
     Args:
         table: A text table or .xlsx workbook; without `psi` and `mueller`, a .dat file of WVASE.
@@ -131,7 +131,7 @@ def from_ellipsometer(
 
 
 def _incidence(read: Table, values: Mapping[str, np.ndarray], angle_is: str | None) -> np.ndarray:
-    """The angle of incidence of each line."""
+    """Return the angle of incidence of each line."""
     if "angle" not in values:
         hint = "name its column, or give it in degrees"
         raise CaptureError("nothing gives the angle", where=f"{read.source}: angle", hint=hint)
@@ -142,7 +142,7 @@ def _incidence(read: Table, values: Mapping[str, np.ndarray], angle_is: str | No
 def _capture(
     incidence: np.ndarray, stokes: Mapping[str, np.ndarray], notes: list[str]
 ) -> xr.Dataset:
-    """A capture of arrays (line or 1, wavelength or 1); blank readings are masked."""
+    """Make a capture from arrays (line or 1, wavelength or 1); blank readings are masked."""
     directions = {key: each[:, None] for key, (_, each) in mirror_views(incidence).items()}
     arrays = np.broadcast_arrays(*directions.values(), *stokes.values())
     lines = dict(zip((*directions, *stokes), (each.ravel() for each in arrays), strict=True))
@@ -165,7 +165,7 @@ def _read_named(
     mueller: str | None,
     sheet: str | None,
 ) -> Table:
-    """The columns that are named, and with `mueller` the elements of Mueller matrices."""
+    """Read the named columns and, with `mueller`, the elements of Mueller matrices."""
     named = [column for each in given.values() for column in _columns(each)]
 
     def chosen(names: list[str]) -> list[str]:
@@ -179,7 +179,7 @@ def _read_named(
 
 
 def _columns(given: Given) -> list[str]:
-    """The names of columns among what is given."""
+    """Return the arguments that are names of columns."""
     each = [given] if given is None or isinstance(given, str | float | int) else given
     return [name for name in each if isinstance(name, str)]
 
@@ -187,7 +187,7 @@ def _columns(given: Given) -> list[str]:
 def _read_wvase(
     table: str | os.PathLike[str],
 ) -> tuple[Table, float, dict[str, Given]]:
-    """A .dat file of WVASE: its columns, the factor of its wavelengths to nm, and what they are."""
+    """Read a .dat file of WVASE: columns, factor from its wavelengths to nm, and their meaning."""
     read = read_table(table, kind="E")
     if not 4 <= len(read.names) <= len(WVASE):
         what = f"psi is not named, and {len(read.names)} columns are no .dat file of WVASE"
@@ -201,7 +201,7 @@ def _read_wvase(
 
 
 def _grid(read: Table, key: str, given: Given) -> np.ndarray:
-    """What is given of a quantity, (line or 1, wavelength or 1)."""
+    """Return the values of a quantity, (line or 1, wavelength or 1)."""
     if names := _columns(given):
         return np.stack([read.columns[name] for name in names], axis=-1)
     numbers = as_numbers(given)
@@ -245,7 +245,7 @@ def _check_angles(read: Table, values: Mapping[str, np.ndarray], unit: str | Non
 def _of_angles(
     values: Mapping[str, np.ndarray], to_degrees: float, notes: list[str]
 ) -> dict[str, np.ndarray]:
-    """Stokes parameters of psi and delta."""
+    """Return Stokes parameters from psi and delta."""
     assumed = {"psi": PSI_ERROR, "delta": DELTA_ERROR}
     radians, errors = {}, {}
     for key in (key for key in assumed if key in values):
@@ -270,7 +270,7 @@ def _of_angles(
 def _of_elements(
     read: Table, mueller: str, incidence: np.ndarray, notes: list[str]
 ) -> dict[str, np.ndarray]:
-    """The Stokes parameter q of elements of Mueller matrices."""
+    """Return the Stokes parameter q from elements of Mueller matrices."""
     elements = {
         (int(match[1]), int(match[2])): name
         for name in read.names

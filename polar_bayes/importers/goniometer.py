@@ -80,7 +80,7 @@ def from_goniometer(
     angle_set_by: str = "hand",
     name: str | None = None,
 ) -> xr.Dataset:
-    """A capture from goniometer readings of s and p light, or of one channel; see the module.
+    """Make a capture from goniometer readings of one or both channels; see the module.
 
     Args:
         s: A two-column table (angle in degrees, reading) or a pair (angles, readings); with
@@ -144,7 +144,7 @@ def from_goniometer(
 
 
 def _views(channels: Mapping[str, "Channel"], given: Mapping[str, float]) -> xr.Dataset:
-    """The views of both channels, or of one alone."""
+    """Return the views of both channels, or of one alone."""
     is_share = any(key.endswith("_incident") for key in given)
     units = "1" if is_share else "arbitrary"
     if len(channels) == 1:
@@ -156,7 +156,7 @@ def _views(channels: Mapping[str, "Channel"], given: Mapping[str, float]) -> xr.
 def _told(
     channels: Collection["Channel"], relative_error: float | None
 ) -> dict[str, str | int | float]:
-    """What became of the readings, as attributes."""
+    """Describe the treatment of the readings in attributes."""
     notes = dict.fromkeys(note for each in channels for note in each.notes)
     error: str | float = RELATIVE_ERROR if relative_error is None else float(relative_error)
     if relative_error is None and any(each.by_scatter for each in channels):
@@ -171,7 +171,7 @@ def _told(
 def _check_levels(
     dark_level: float, relative_error: float | None, **levels: float | None
 ) -> dict[str, float]:
-    """The incident levels and errors that are given, each in its range."""
+    """Refuse incident levels and errors outside their ranges."""
     LEVEL.check(dark_level, "dark_level")
     if relative_error is not None:
         Interval(0.0, 1.0, open_high=True).check(relative_error, "relative_error")
@@ -185,7 +185,7 @@ def _check_levels(
 
 
 def _check_channels(asked: Mapping[str, Readings | None], given: Mapping[str, float]) -> None:
-    """Refuse channels that do not go together, and levels of a channel that is not there."""
+    """Refuse incompatible channels, and levels of a channel without readings."""
     present = {key for key, readings in asked.items() if readings is not None}
     if not present or ("unpolarized" in present and len(present) > 1):
         what = "no channel is there" if not present else "unpolarized light is a channel alone"
@@ -201,7 +201,7 @@ def _check_channels(asked: Mapping[str, Readings | None], given: Mapping[str, fl
 
 
 def _refuse_swapped(capture: xr.Dataset) -> None:
-    """Refuse s and p where s lies below p at nearly every angle, Brewster's included."""
+    """Refuse s and p if s lies below p at nearly every angle, including Brewster's."""
     q, limit = capture["q"], 2.0 * capture["q_error"]
     # Nearer to the normal s and p differ too little.
     compared = capture["valid"] & (capture["view_zenith"] >= 10.0)
@@ -216,7 +216,7 @@ def _refuse_swapped(capture: xr.Dataset) -> None:
 
 
 def _combined(s: "Channel", p: "Channel", units: str) -> xr.Dataset:
-    """Views at the angles of either channel."""
+    """Return views at the angles of either channel, from both."""
     angle = np.union1d(s.angle, p.angle)
     S, S_error, S_interpolated = s.at(angle)
     P, P_error, P_interpolated = p.at(angle)
@@ -246,7 +246,7 @@ def _combined(s: "Channel", p: "Channel", units: str) -> xr.Dataset:
 
 
 def _alone(channel: "Channel", units: str) -> xr.Dataset:
-    """Views of one channel, which have an intensity and no polarization."""
+    """Return views of one channel, which have an intensity and no polarization."""
     light, error, _ = channel.at(channel.angle)
     return xr.Dataset(
         {
@@ -261,7 +261,7 @@ def _alone(channel: "Channel", units: str) -> xr.Dataset:
 
 
 class Rows(NamedTuple):
-    """Readings of one channel as they come. Shape (row,) each; `places` names each in errors."""
+    """Raw readings of one channel, each (row,); errors name rows by `places`."""
 
     name: str
     angle: np.ndarray
@@ -272,7 +272,7 @@ class Rows(NamedTuple):
     notes: list[str]
 
     def at_incidence(self, angle_is: str | None) -> "Rows":
-        """The same at angles of incidence, without rows that hold no reading."""
+        """Return rows at angles of incidence, without those that hold no reading."""
         brightens = None if self.name == "p" else self.reading
         angle = as_incidence(self.angle, angle_is, self.places, brightens)
         wrong = np.abs(self.reading) >= LARGEST_READING
@@ -295,7 +295,7 @@ class Rows(NamedTuple):
         )
 
     def averaged(self, relative_error: float | None) -> "Channel":
-        """The mean at each angle, with its error; by default their scatter tells the error."""
+        """Return the mean at each angle, with its error, by default from the scatter."""
         angle, first, group, count = np.unique(
             self.angle, return_index=True, return_inverse=True, return_counts=True
         )
@@ -340,7 +340,7 @@ class Rows(NamedTuple):
 
 
 def _scatter(mean: np.ndarray, square: np.ndarray, freedom: np.ndarray) -> tuple[float, float]:
-    """Absolute and relative error that sums of squares around means show."""
+    """Estimate absolute and relative error from sums of squared deviations from means."""
     unit = float(np.abs(mean).max()) or 1.0
     design = np.stack([np.ones_like(mean), (mean / unit) ** 2], axis=-1)
     variance = square / freedom
@@ -354,7 +354,7 @@ def _scatter(mean: np.ndarray, square: np.ndarray, freedom: np.ndarray) -> tuple
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Channel:
-    """Light of one channel, sorted by angle, a row each; `places` names each in errors.
+    """Light of one channel, one row per angle in ascending order; errors name rows by `places`.
 
     The error of one reading is that at no light (`absolute`) and over the reading (`relative`); a
     row is the mean of `count` of them.
@@ -372,14 +372,14 @@ class Channel:
     by_scatter: bool
 
     def refuse(self, wrong: np.ndarray, what: str, hint: str) -> None:
-        """Raise for the first wrong row."""
+        """Raise an error for the first row that is wrong."""
         if wrong.any():
             row = int(np.argmax(wrong))
             values = f"(angle {self.angle[row]:g}, {self.name} {self.light[row]:g})"
             raise CaptureError(f"{what} {values}", where=self.places[row], hint=hint)
 
     def scaled(self, dark_level: float, incident: float | None, error: float | None) -> "Channel":
-        """The light above the dark level, over the incident light where that is known."""
+        """Subtract the dark level, and divide by the incident light if it is known."""
         light = self.light - dark_level
         errors, notes = np.full_like(self.absolute, error or 0.0), self.notes
         if error is None:
@@ -402,7 +402,7 @@ class Channel:
         return dataclasses.replace(self, light=light / full, absolute=errors / full, notes=notes)
 
     def _scatter(self) -> np.ndarray:
-        """Departure of the neighbors of each row from a parabola; 0 where there are too few."""
+        """Return the deviation of each row's neighbors from a parabola; 0 with too few rows."""
         found = np.zeros_like(self.light)
         for k in range(self.angle.size) if self.angle.size > 6 else ():
             near = np.argsort(np.abs(self.angle - self.angle[k]))[1:7]
@@ -418,7 +418,7 @@ class Channel:
         return np.hypot(self.absolute, self.relative * self.light) / np.sqrt(self.count)
 
     def at(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Light and its error at these angles, and which of them are interpolated."""
+        """Return light and its error at these angles, and which angles are interpolated."""
         light, error = np.full((2, angle.size), np.nan)
         read = np.isin(angle, self.angle)
         light[read], error[read] = self.light, self.error
@@ -438,7 +438,7 @@ class Channel:
 
 
 def _interpolation_error(angle: np.ndarray, logs: np.ndarray) -> np.ndarray:
-    """Standard deviation of the interpolated logarithm in each gap. Shape (row - 1,)."""
+    """Return the sd of the interpolated logarithm in each gap, (row - 1,)."""
     if angle.size < 3:  # no reading can be left out: a uniform distribution between the two
         return np.abs(np.diff(logs)) / math.sqrt(12.0)
     residual = np.full(angle.shape, np.nan)
@@ -466,7 +466,7 @@ def _read(
     angle: str | None,
     sheet: str | None,
 ) -> dict[str, "Rows"]:
-    """The channels that are asked for, from one table, from tables of their own, or from arrays."""
+    """Read the requested channels from one table, from a table each, or from arrays."""
     channels = {key: each for key, each in asked.items() if each is not None}
     if table is None and angle is not None:
         hint = "give the table, or s and p as tables of their own"
@@ -484,7 +484,7 @@ def _read(
 
 
 def _rows_of_own(name: str, readings: Readings, sheet: str | None) -> "Rows":
-    """A channel from a table of two columns, or from a pair of arrays."""
+    """Read a channel from a table of two columns, or from a pair of arrays."""
     if not isinstance(readings, str | os.PathLike):
         return _rows_of_arrays(name, readings)
     table = read_table(readings, sheet=sheet)
@@ -496,7 +496,7 @@ def _rows_of_own(name: str, readings: Readings, sheet: str | None) -> "Rows":
 
 
 def _rows_of(name: str, table: Table, angle: str, reading: str) -> Rows:
-    """A channel from two columns of a table; its errors are the resolution of the print."""
+    """Read a channel from two columns of a table; the last printed digit gives the error."""
     if not np.isfinite(table.columns[reading]).any():
         where = f"{table.source}: column {reading}"
         raise CaptureError("no line has a reading", where=where, hint="name another column")
@@ -534,6 +534,6 @@ def _rows_of_arrays(name: str, readings: Any) -> Rows:
 
 
 def _last_digit(reading: np.floating) -> float:
-    """Value of the last digit that a number needs in print, in its own precision."""
+    """Return the value of the last digit needed to print a number in its own precision."""
     digits = np.format_float_positional(reading, trim="-")
     return float(f"1e{Decimal(digits).as_tuple().exponent}")

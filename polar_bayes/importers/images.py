@@ -1,4 +1,4 @@
-r"""Captures from camera frames of polarized light, in the plane of each piece of surface.
+r"""Captures from camera frames of polarized light, by the local plane of incidence.
 
 A reading that cannot be used stays, marked valid=False, and is counted under one reason, the first
 that applies: outside the surface, turned away from the camera, in its own shadow (cast shadows are
@@ -61,7 +61,7 @@ from polar_bayes.importers.stokes import StokesImage, check_angles, fit_stokes, 
 
 @dataclasses.dataclass(frozen=True)
 class Binning:
-    """Blocks of `bin` x `bin` pixels are averaged; `window` x `window` blocks make one pixel."""
+    """Averages of `bin` x `bin` pixels in blocks, and of `window` x `window` blocks in pixels."""
 
     frame: tuple[int, int]
     bin: int
@@ -79,36 +79,36 @@ class Binning:
 
     @property
     def width(self) -> int:
-        """Pixels of the frame along each side of a pixel of the capture."""
+        """Width of a pixel of the capture in pixels of the frame."""
         return self.bin * self.window
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Pixels of the capture along rows and columns; what is left at the far edges is unused."""
+        """Number of rows and columns of the capture; the rest at the far edges is unused."""
         return self.frame[0] // self.width, self.frame[1] // self.width
 
     def centers(self, width: int) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns at the centers of blocks of that width."""
+        """Return rows and columns at the centers of blocks of that width."""
         ends = (n * self.width for n in self.shape)
         rows, columns = (np.arange(0, end, width) + 0.5 * (width - 1) for end in ends)
         return rows, columns
 
     def blocks(self, values: np.ndarray) -> np.ndarray:
-        """Values (..., row, column) as (..., row, column, pixel of the block)."""
+        """Reshape values (..., row, column) to (..., row, column, pixel of the block)."""
         rows, columns = (n * self.window for n in self.shape)
         used = values[..., : rows * self.bin, : columns * self.bin]
         return used.reshape(*values.shape[:-2], rows, self.bin, columns, self.bin)
 
     def mean(self, values: np.ndarray) -> np.ndarray:
-        """Averages of (..., row, column) over the blocks."""
+        """Average values (..., row, column) over the blocks."""
         return self.blocks(values).mean(axis=(-3, -1))
 
     def any(self, values: np.ndarray) -> np.ndarray:
-        """Whether any value of a block is true."""
+        """Return True for blocks in which any value is true."""
         return self.blocks(values).any(axis=(-3, -1))
 
     def views(self, values: np.ndarray) -> np.ndarray:
-        """Readings (row, column) as (y, x, view)."""
+        """Reshape readings (row, column) to (y, x, view)."""
         (rows, columns), w = self.shape, self.window
         windows = values.reshape(rows, w, columns, w).transpose(0, 2, 1, 3)
         return windows.reshape(rows, columns, w * w)
@@ -118,13 +118,13 @@ class Binning:
 
 
 FACING = Direction(0.0, 0.0, 1.0)
-"""A camera that is far away."""
+"""View from a distant camera, along the axis of the frame."""
 
 
 def _locate(
     shape: object, view: object, light: object, binning: Binning
 ) -> tuple[LocalGeometry, dict[str, str]]:
-    """Directions at every reading, and the attributes that describe surface, view and light."""
+    """Return directions at every reading, and attributes of surface, view and light."""
     surface, view = as_shape(shape), as_location(view, "view")
     surface.check(binning.frame)
     rows, columns = np.meshgrid(*binning.centers(binning.bin), indexing="ij")
@@ -146,7 +146,7 @@ def _locate(
 def _light_of_highlight(
     highlight: Highlight, surface: AbstractShape, view: AbstractLocation, frame: tuple[int, int]
 ) -> Direction:
-    """Direction of distant light from the place where the surface mirrors it to the camera."""
+    """Return the direction of distant light from the place of its mirror image."""
     row, column = np.array([highlight.row]), np.array([highlight.column])
     inside = highlight.row <= frame[0] - 1 and highlight.column <= frame[1] - 1
     normal = surface.normals(row, column, 1)[0] if inside else np.full(3, np.nan)
@@ -158,7 +158,7 @@ def _light_of_highlight(
 
 
 def _points(rows: np.ndarray, columns: np.ndarray, frame: tuple[int, int]) -> np.ndarray:
-    """Points of the frame in the camera's axes, on the plane z = 0."""
+    """Return points of the frame in the camera's axes, on the plane z = 0."""
     x, y = columns - 0.5 * (frame[1] - 1), 0.5 * (frame[0] - 1) - rows
     return np.stack([x, y, np.zeros_like(x)], axis=-1)
 
@@ -175,7 +175,7 @@ def _capture(
     attributes: dict[str, str],
     wavelength: float | None,
 ) -> xr.Dataset:
-    """A capture from binned light (angle, row, column), its variance, and saturated bins."""
+    """Make a capture from binned light (angle, row, column), its variance, and flags."""
     relative = float(signal.metadata["relative_error"])
     stokes = fit_stokes(light, variance + (relative * light) ** 2, angles)
     stokes = stokes.rotated(geometry.cos_twice, geometry.sin_twice)
@@ -236,7 +236,7 @@ def _capture(
 def _measured_gamma(
     light: np.ndarray, variance: np.ndarray, angles: np.ndarray, used: np.ndarray, signal: Signal
 ) -> dict[str, float]:
-    """The gamma of the files that the redundancy of the angles means, as attributes."""
+    """Estimate the gamma of the files from redundant angles, as attributes."""
     # Noise is to be small, and the shape of the light is to stay.
     coarse, metadata = Binning(used.shape, max(1, min(used.shape) // 32), 1), signal.metadata
     noise, used = coarse.mean(variance) / coarse.bin**2, ~coarse.any(~used)
@@ -249,7 +249,7 @@ def _measured_gamma(
 def _reasons_to_mask(
     stokes: StokesImage, geometry: LocalGeometry, saturated: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """The readings that cannot be used, each under its first reason."""
+    """Return the readings that cannot be used, each under its first reason."""
     with np.errstate(invalid="ignore"):
         # In darker light a quotient is no longer normal.
         dark = ~(stokes.intensity > 10.0 * np.sqrt(stokes.intensity_variance))
@@ -272,7 +272,7 @@ def _reasons_to_mask(
 
 
 def _names(frames: Sequence[Frame], name: str | None, default: str) -> dict[str, str]:
-    """The attributes `name` and `source` of a capture."""
+    """Return the attributes `name` and `source` of a capture."""
     files = [os_name(frame) for frame in frames if not isinstance(frame, np.ndarray)]
     stem = files[0].rsplit(".", 1)[0] if files else default
     return {"name": name or stem, "source": ", ".join(files) or "arrays"}
@@ -294,7 +294,7 @@ def from_polarizer(
     wavelength: float | None = None,
     name: str | None = None,
 ) -> xr.Dataset:
-    """A capture from frames of a camera behind a linear polarizer.
+    """Make a capture from frames of a camera behind a linear polarizer.
 
     Axes of the camera: x to the right, y up, z from the scene to the camera; rows and columns of a
     frame count from zero at its upper left pixel.
@@ -359,14 +359,14 @@ def from_polarizer(
 
 
 SONY = ((90.0, 45.0), (135.0, 0.0))
-"""Angles of the four pixels of IMX250MZR and its relatives."""
+"""Polarizer angles of the four pixels of IMX250MZR and related sensors."""
 
 AT = ((1, 1), (0, 1), (0, 0), (1, 0))
-"""Row and column of the pixels that polanalyser takes for 0, 45, 90 and 135 degrees."""
+"""Row and column of the pixels that polanalyser assigns to 0, 45, 90 and 135 degrees."""
 
 
 REACH = 4
-"""Pixels from which polanalyser fills in, at most, in a color mosaic."""
+"""Largest distance, in pixels, over which polanalyser interpolates a color mosaic."""
 
 
 def from_mosaic(
@@ -383,7 +383,7 @@ def from_mosaic(
     wavelength: float | None = None,
     name: str | None = None,
 ) -> xr.Dataset:
-    """A capture from one raw frame of a polarization camera, monochrome or in color.
+    """Make a capture from one raw frame of a polarization camera, monochrome or in color.
 
     Args:
         frame: A PNG, TIFF, JPEG or .npy file, or an array of shape (row, column): raw counts, with
@@ -449,7 +449,7 @@ def from_mosaic(
 
 
 def _centers(color: Sequence[float] | None, wavelength: float | None) -> tuple[float | None, ...]:
-    """The wavelength of each color, blue first."""
+    """Return the wavelength of each color, blue first."""
     if color is None:
         return (wavelength,)
     if wavelength is not None:
@@ -463,7 +463,7 @@ def _centers(color: Sequence[float] | None, wavelength: float | None) -> tuple[f
 
 
 def _spectral(captures: Sequence[xr.Dataset]) -> xr.Dataset:
-    """The captures of all colors as one with wavelengths; masked readings are counted together."""
+    """Combine the captures of all colors along wavelength, and count masked readings."""
     kept = [name for name in captures[0].data_vars if str(name).endswith(("zenith", "azimuth"))]
     colors = xr.concat([each.drop_vars(kept) for each in captures], "wavelength")
     attributes = dict(captures[0].attrs)
@@ -477,7 +477,7 @@ def _spectral(captures: Sequence[xr.Dataset]) -> xr.Dataset:
 
 
 def _demosaiced(polanalyser: ModuleType, light: np.ndarray, *, is_color: bool) -> np.ndarray:
-    """Light at each angle in every pixel, (angle, row, column, color), blue first."""
+    """Return light at each angle in every pixel, (angle, row, column, color), blue first."""
     # The library works on whole numbers up to 65535 and cuts off what lies outside. Filling in is
     # linear, so the frame is shifted and stretched to just that range and back: dark pixels whose
     # noise lies below zero stay what they are.
@@ -492,7 +492,7 @@ def _demosaiced(polanalyser: ModuleType, light: np.ndarray, *, is_color: bool) -
 def _color_variance(
     polanalyser: ModuleType, variance: np.ndarray, binning: Binning, color: int
 ) -> np.ndarray:
-    """Variance of the average of each angle over each bin, of one color, (angle, row, column)."""
+    """Return variances of angle averages over bins in one color, (angle, row, column)."""
     b, width = binning.bin, binning.bin + 4 * REACH
     block = slice(2 * REACH, 2 * REACH + b)
     square, ours = np.zeros(4), np.zeros((4, width, width), bool)
@@ -512,7 +512,7 @@ def _color_variance(
 
 
 def _variance(variance: np.ndarray, binning: Binning) -> np.ndarray:
-    """Variance of the average of each angle over each bin, (angle, row, column)."""
+    """Return variances of angle averages over bins, (angle, row, column)."""
     b = binning.bin
     ratio = ((2.0 * b - 1.5) / b**2) ** 2
     half = Binning((binning.frame[0] // 2, binning.frame[1] // 2), b // 2, binning.window)

@@ -1,4 +1,4 @@
-r"""The exponent of counts that best restores the redundancy of four analyzer angles or more.
+r"""Estimate of the gamma of frames from the redundancy of four analyzer angles or more.
 
 Light I behind analyzers at k angles lies in three dimensions, $I = A S$, so that $B I = 0$ for the
 k - 3 rows of B that are orthogonal to A; at 0, 45, 90 and 135 degrees that is
@@ -38,7 +38,7 @@ from polar_bayes.importers.stokes import polarizer_design
 def restoring_exponent(
     light: np.ndarray, noise: np.ndarray, error: float, angles: np.ndarray, used: np.ndarray
 ) -> tuple[float, float] | None:
-    """The exponent that makes counts linear, and its standard uncertainty.
+    """Estimate the exponent that makes counts linear, and its standard uncertainty.
 
     Args:
         light: Counts less the dark level, (angle, row, column).
@@ -86,7 +86,7 @@ def _regression(
     used: np.ndarray,
     g: float,
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Regressors, x last, (pixel, redundancy, regressor), responses, and the variance of x.
+    """Return regressors, x last, (pixel, redundancy, regressor), responses, and x's variance.
 
     All are over the errors; the variances are those of noise, and of noise and other errors.
     """
@@ -106,7 +106,7 @@ def _regression(
 
 
 def _huber(columns: np.ndarray, response: np.ndarray) -> tuple[float, float]:
-    """The last coefficient by Huber's M-estimator, and the mean squared residual."""
+    """Return the last coefficient by Huber's M-estimator, and the mean squared residual."""
     weights = np.ones(len(response))
     for _ in range(8):
         weighted = (weights[:, None, None] * columns).reshape(-1, columns.shape[-1]).T

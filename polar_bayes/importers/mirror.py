@@ -1,4 +1,4 @@
-"""Views at the mirror angle: what an angle that was read off means, and the directions of a view.
+"""Views at the mirror angle: conversion of angle scales, and directions of views.
 
 The angle of incidence counts from the surface normal. Other scales name the same directions: the
 angle from the surface, 90 degrees less it; two theta, the angle between both arms on the side of
@@ -22,7 +22,7 @@ ANGLE_IS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = MappingProxyType(
         "deviation": lambda angle: 90.0 - 0.5 * angle,
     }
 )
-"""The angle of incidence from each scale of the angle, all in degrees and positive."""
+"""Conversion of each angle scale to the angle of incidence, in degrees, >= 0."""
 
 
 def as_incidence(
@@ -31,7 +31,7 @@ def as_incidence(
     places: Sequence[str],
     reading: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Angles of incidence, in degrees, from angles of some scale.
+    """Convert angles of some scale to angles of incidence, in degrees.
 
     Args:
         angle: As read off, degree. Shape (row,).
@@ -55,7 +55,7 @@ def as_incidence(
 
 
 def _guess(angle: np.ndarray, reading: np.ndarray | None) -> str:
-    """Which scale angles probably have that are no angles of incidence."""
+    """Suggest the scale of angles that cannot be angles of incidence."""
     hint = "give degrees from the surface normal"
     if np.nanmin(angle) < 0.0 and np.nanmax(np.abs(angle)) < 90.0:
         what = "a scan through zero" if np.nanmax(angle) > 0.0 else "the other side of the normal"
@@ -74,7 +74,7 @@ def _guess(angle: np.ndarray, reading: np.ndarray | None) -> str:
 
 
 def mirror_views(incidence: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
-    """Directions of views that a mirror sends the light to. Angles in degrees, (view,)."""
+    """Return directions of views in the mirror direction; angles in degrees, (view,)."""
     return {
         "view_zenith": ("view", incidence),
         "view_azimuth": ("view", np.full_like(incidence, 180.0)),

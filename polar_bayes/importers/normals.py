@@ -26,7 +26,7 @@ class AbstractShape(abc.ABC):
 
     @abc.abstractmethod
     def normals(self, rows: np.ndarray, columns: np.ndarray, width: int) -> np.ndarray:
-        """Unit normals in the axes of the camera.
+        """Return unit normals in the axes of the camera.
 
         Args:
             rows: Row at the center of each square of pixels, any shape.
@@ -39,17 +39,17 @@ class AbstractShape(abc.ABC):
 
     @abc.abstractmethod
     def check(self, shape: tuple[int, ...]) -> None:
-        """Refuse frames of this shape (row, column) if the surface is not that of such frames."""
+        """Refuse frames of shape (row, column) that do not match the surface."""
 
     @property
     @abc.abstractmethod
     def description(self) -> str:
-        """The shape as text, for an attribute of the capture."""
+        """Text that describes the shape, for an attribute of the capture."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Sphere:
-    """The outline of a sphere that is seen from far away.
+    """Outline of a sphere that is seen from far away.
 
     Args:
         row: Of the center, pixels.
@@ -71,7 +71,7 @@ class Sphere:
 
 @dataclasses.dataclass(frozen=True)
 class Spheres(AbstractShape):
-    """One sphere or several, none before another; outside of them there is no surface.
+    """One or more spheres, none in front of another; there is no surface outside of them.
 
     Args:
         spheres: Their outlines.
@@ -121,7 +121,7 @@ class Spheres(AbstractShape):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class NormalMap(AbstractShape):
-    """A normal for each pixel of the frame.
+    """Normals of a frame, one for each pixel.
 
     Args:
         values: Unit normals (x to the right, y up, z to the camera), shape (row, column, 3), or a
@@ -182,7 +182,7 @@ class NormalMap(AbstractShape):
 
 
 def fit_sphere(rim: ArrayLike | os.PathLike[str]) -> Sphere:
-    """The outline of a sphere through points on its rim, by least squares of their distances.
+    """Fit the outline of a sphere to points on its rim by least squares of distances.
 
     Args:
         rim: Four points or more: an array of shape (point, 2), row and column in pixels, or a
@@ -223,7 +223,7 @@ ShapeLike = AbstractShape | Sphere | Sequence[Sphere] | np.ndarray | str | os.Pa
 
 
 def as_shape(shape: object) -> AbstractShape:
-    """A shape from a user's argument."""
+    """Return a shape from a user's argument."""
     if isinstance(shape, AbstractShape):
         return shape
     if isinstance(shape, Sphere):

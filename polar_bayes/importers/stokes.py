@@ -43,7 +43,7 @@ class StokesImage:
     misfit: np.ndarray | None
 
     def rotated(self, cos: np.ndarray, sin: np.ndarray) -> "StokesImage":
-        """The same light in axes rotated counterclockwise, as the camera sees it."""
+        """Return the Stokes parameters in axes rotated counterclockwise, as the camera sees it."""
         q_variance, u_variance, between = self.q_variance, self.u_variance, self.covariance
         mixed = 2.0 * cos * sin * between
         return dataclasses.replace(
@@ -62,7 +62,7 @@ class StokesImage:
 
 
 def fit_stokes(light: np.ndarray, variance: np.ndarray, angles: object) -> StokesImage:
-    """Stokes parameters by least squares."""
+    """Estimate Stokes parameters by least squares."""
     design = polarizer_design(check_angles(angles))
     solve = np.linalg.pinv(design)
     S = np.einsum("sa,ayx->syx", solve, light)
@@ -86,7 +86,7 @@ def fit_stokes(light: np.ndarray, variance: np.ndarray, angles: object) -> Stoke
 
 
 def unbiased_dop(image: StokesImage) -> tuple[np.ndarray, np.ndarray]:
-    """Degree of polarization with what noise alone adds to it taken off, and its error."""
+    """Return the degree of polarization, corrected for the bias by noise, and its error."""
     p = np.hypot(image.q, image.u)
     with np.errstate(divide="ignore", invalid="ignore"):
         along_q = np.where(p > 0.0, image.q / p, 1.0)
@@ -101,7 +101,7 @@ def unbiased_dop(image: StokesImage) -> tuple[np.ndarray, np.ndarray]:
 
 
 def check_angles(angles: object) -> np.ndarray:
-    """Angles of a polarizer, refused unless they determine all three Stokes parameters."""
+    """Refuse polarizer angles unless they determine all three Stokes parameters."""
     degrees = as_numbers(angles)
     if degrees.ndim != 1 or not (np.abs(degrees) <= 360.0).all():
         hint = "give one number from -360 to 360 for each frame"
@@ -120,7 +120,7 @@ def check_angles(angles: object) -> np.ndarray:
 
 
 def polarizer_design(degrees: np.ndarray) -> np.ndarray:
-    """Sensitivity of each angle to S0, S1 and S2: (angle, 3)."""
+    """Return the sensitivity of each angle to S0, S1 and S2, (angle, 3)."""
     twice = np.deg2rad(2.0 * degrees)
     return 0.5 * np.stack([np.ones_like(twice), np.cos(twice), np.sin(twice)], axis=-1)
 
@@ -128,7 +128,7 @@ def polarizer_design(degrees: np.ndarray) -> np.ndarray:
 def _misfit(
     light: np.ndarray, variance: np.ndarray, design: np.ndarray, solve: np.ndarray
 ) -> np.ndarray | None:
-    """Mean squared residual over its variance; None where three angles leave no residual."""
+    """Return the mean squared residual over its variance; None for three angles."""
     beyond = np.linalg.svd(design)[0].T[design.shape[1] :]
     if not len(beyond):
         return None

@@ -46,9 +46,9 @@ KNOWN["aolp"] = Variable(
     "give degrees from the s axis, or from the p axis by aolp_from='p'", "dop",
 )  # fmt: skip
 AXES = {"s": 0.0, "p": 90.0}
-"""Angle of each axis from the s axis, degree."""
+"""Angle of each polarization axis from the s axis, degree."""
 MUELLER = re.compile(r"[mM]_?\[?([0-4])_?,?([0-4])\]?")
-"""Name of an element of a Mueller matrix."""
+"""Pattern of the name of an element of a Mueller matrix."""
 
 
 def from_table(
@@ -66,7 +66,7 @@ def from_table(
     saturation_level: float | None = None,
     name: str | None = None,
 ) -> xr.Dataset:
-    """A capture from a table with a line for each reading; see the module.
+    """Make a capture from a table with a line for each reading; see the module.
 
     Args:
         table: A text table or .xlsx workbook whose first line names the columns. Columns that are
@@ -104,7 +104,7 @@ def from_table(
         raise CaptureError("the angle of a mirror is not named", where="angle_is", hint=hint)
 
     def chosen(names: list[str]) -> list[str]:
-        """The columns that are used; a line without the first one is left out."""
+        """Return the columns to use; a line without the first one is left out."""
         used.update(_columns(names, given, ignored, str(table)))
         _check_constants(constants, used, str(table))
         order = sorted(used, key=lambda variable: variable != "view_zenith")
@@ -138,7 +138,7 @@ def from_table(
 def _columns(
     names: Sequence[str], columns: Mapping[str, str], ignored: Sequence[str], source: str
 ) -> dict[str, str]:
-    """The column of each variable; every column is used or ignored."""
+    """Return the column of each variable; every column is used or ignored."""
     for column in (*columns.values(), *ignored):
         check_column(column, names, source)
     for variable, column in columns.items():
@@ -160,7 +160,7 @@ def _columns(
 def _check_constants(
     constants: Mapping[str, float], columns: Mapping[str, str], source: str
 ) -> None:
-    """Refuse constants that are no numbers or also columns, and missing directions."""
+    """Refuse constants that are not numbers or also columns, and missing directions."""
     for variable, value in constants.items():
         _check_name(variable, source)
         if not (isinstance(value, Real) and abs(value) <= sys.float_info.max):
@@ -184,7 +184,7 @@ def _check_name(variable: str, where: str) -> None:
 def _stated_errors(
     read: Table, columns: Mapping[str, str], values: Mapping[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """Errors that cells state behind their readings, of variables that have no others."""
+    """Return errors that cells state, of variables that have no other errors."""
     found = {}
     for variable, column in columns.items():
         name, error = f"{variable}_error", read.errors[column]
@@ -202,7 +202,7 @@ def _stated_errors(
 def _mask_blanks(
     values: dict[str, np.ndarray], columns: Mapping[str, str], read: Table
 ) -> list[str]:
-    """Mark lines in which a reading is blank as not valid; refuse other blanks."""
+    """Mark lines with blank readings as not valid; refuse other blanks."""
     blank = np.zeros(len(read.lines), bool)
     for variable, column in columns.items():
         missing = np.isnan(values[variable])
@@ -221,7 +221,7 @@ def _mask_blanks(
 def _normalized_stokes(
     values: dict[str, np.ndarray], axis: float, source: str
 ) -> dict[str, np.ndarray]:
-    """Stokes q and u from degree and angle of polarization, with the error of the degree."""
+    """Return Stokes q and u, with errors, from degree and angle of polarization."""
     if "dop" not in values or "q" in values:
         hint = "give dop and aolp, or q and u"
         raise CaptureError("aolp makes q and u of dop alone", where=source, hint=hint)
@@ -234,7 +234,7 @@ def _normalized_stokes(
 def _check_values(
     values: Mapping[str, np.ndarray], columns: Mapping[str, str], lines: Sequence[int], source: str
 ) -> None:
-    """Check each number against the contract, by its line; readings only where they are valid."""
+    """Check each number by the contract; readings are checked only where valid."""
     valid = values.get("valid", np.ones(len(lines))) != 0.0
     for variable in (name for name in values if name in KNOWN):
         row, numbers = KNOWN[variable], values[variable]
@@ -273,7 +273,7 @@ def _of_materials(
 def capture_of_lines(
     values: dict[str, np.ndarray], saturation_level: float | None = None
 ) -> xr.Dataset:
-    """The capture of lines of one material; those of several wavelengths are views by direction."""
+    """Make a capture from lines of one material; lines of one direction are one view."""
     values = dict(values)
     waves = values.pop("wavelength", None)
     if waves is None or len(np.unique(waves)) == 1:
@@ -287,7 +287,7 @@ def capture_of_lines(
 
 
 def _spectral(values: dict[str, np.ndarray], waves: np.ndarray) -> xr.Dataset:
-    """Lines of several wavelengths; the entry of a view that lacks one is not valid."""
+    """Arrange lines of several wavelengths; views are masked at wavelengths they lack."""
     label, column = np.unique(waves, return_inverse=True)
     view = _views(values, column)
     first = np.unique(view, return_index=True)[1]
@@ -304,7 +304,7 @@ def _spectral(values: dict[str, np.ndarray], waves: np.ndarray) -> xr.Dataset:
 
 
 def _views(values: dict[str, np.ndarray], column: np.ndarray) -> np.ndarray:
-    """The view of each line: one for each set of directions, and one more for each repetition."""
+    """Return the view of each line: one for each set of directions and each repetition."""
     directions = {name: values[name] for name in PER_VIEW if name in values}
     lines = pd.DataFrame({**directions, "column": column})
     lines["repetition"] = lines.groupby([*lines], sort=False).cumcount()

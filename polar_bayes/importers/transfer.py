@@ -1,4 +1,4 @@
-r"""Opto-electronic transfer functions: how the counts of a picture follow from light, and back.
+r"""Opto-electronic transfer functions: the relation between light and counts of a picture.
 
 A sensor counts in proportion to light; a picture made to be looked at has a tone curve. With V the
 count over the white count, light is
@@ -30,7 +30,7 @@ from polar_bayes.errors import CaptureError
 
 
 class Transfer(NamedTuple):
-    """A transfer function that is undone.
+    """The correction of one tone curve.
 
     Args:
         description: What is done, as an attribute of the capture.
@@ -50,7 +50,7 @@ def _srgb(counts: np.ndarray, white: float) -> np.ndarray:
 
 
 def as_transfer(transfer: object) -> Transfer:
-    """The transfer function of a name or a gamma.
+    """Return the transfer function of a name or a gamma.
 
     Args:
         transfer: `"srgb"`, `"linear"`, a gamma from 0.2 to 5, also as text, or None: not stated,
@@ -77,7 +77,7 @@ def as_transfer(transfer: object) -> Transfer:
 
 
 def stated_curve(image: Image.Image) -> str:
-    """What an image states about a tone curve; empty if nothing."""
+    """Return the tone curve that an image states; empty if none."""
     info, exif = image.info, image.getexif()
     gamma = info.get("gamma", 1.0)  # 1 is linear
     color_space = exif.get_ifd(0x8769).get(0xA001, exif.get(0xA001))

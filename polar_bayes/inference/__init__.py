@@ -1,4 +1,4 @@
-"""From a model and data to posterior draws."""
+"""Inference: from a model and data to posterior draws."""
 
 from polar_bayes.namespace import attach
 

@@ -30,23 +30,22 @@ from polar_bayes.numerics.levenberg_marquardt import (
 from polar_bayes.observation.data import Observations
 
 PRIOR_DRAWS = 32
-"""Draws from the prior among which a starting point is chosen unless settings say otherwise."""
+"""Default number of prior draws among which a starting point is chosen."""
 
 RESTARTS = tuple(range(1, 8))
-"""Ranks of the prior draws from which pixels without a good mode start again."""
+"""Ranks of the prior draws from which pixels without an acceptable mode start again."""
 
 RANKS, SAME_MODE = 16, 0.1
-"""Prior draws that are kept, from all of which a search for all modes starts; posterior sds within
-which two ends are the same mode."""
+"""Number of prior draws from which a search for all modes starts; largest distance, in posterior
+sds, between two ends of searches that count as one mode."""
 
 SINGLE_PASSES, EXACT_PASSES = (5, 4, 8, 16, 32), (1, 1, 1, 2, 4, 8, 16)
-"""Steps of each pass; pixels that have converged leave between passes. The first exact pass only
-evaluates the derivatives, which is enough for most pixels. The expected information is positive
-definite everywhere and exact curvature is not, so that the long way is gone with the former:
-narrow lobes take up to 60 steps."""
+"""Steps of each pass; converged pixels leave between passes. The first exact pass only evaluates
+the derivatives, which is enough for most pixels. Most steps use the expected information, which is
+positive definite everywhere, unlike the exact Hessian; narrow lobes take up to 60 steps."""
 
 GOALS = {"double": 1e-4, "single": 1e-2}
-"""The decrement at which a pixel has converged; single precision resolves it no better."""
+"""Newton decrement at which a pixel has converged; single precision resolves no smaller one."""
 
 
 class ModeSearch(NamedTuple):
@@ -60,7 +59,7 @@ class ModeSearch(NamedTuple):
 def find_starts(
     batch: ProblemBatch, candidates: int = PRIOR_DRAWS
 ) -> Float[np.ndarray, "pixel rank size"]:
-    """Draws from the prior at which each pixel starts, the one of highest density first."""
+    """Return prior draws from which each pixel starts, the one of highest density first."""
     # The largest program compiles while the others are traced and run.
     unknown = init(np.zeros((1, batch.engine.program.size), batch.engine.dtype))
     batch.begin(_stepping, False, unknown, given=(np.int32(1),))
@@ -70,7 +69,7 @@ def find_starts(
 def find_modes_from(
     batch: ProblemBatch, start: Float[np.ndarray, "pixel size"], known: ModeSearch | None = None
 ) -> ModeSearch:
-    """The mode of every pixel, from a vector of its own; a search that ends at `known` is that."""
+    """Find the mode of every pixel from its own start; a search that ends at `known` returns it."""
     fast = jax.tree.map(np.array, init(start))
     for count in SINGLE_PASSES:
         left = np.flatnonzero(~fast.settled)
@@ -115,7 +114,7 @@ def _advance(
 def find_all_modes(
     batch: ProblemBatch,
 ) -> tuple[Int[np.ndarray, " mode"], NormalApproximation]:
-    """Distinct modes of each pixel, the heaviest first, and the pixel that each belongs to."""
+    """Find distinct modes, heaviest first, and the pixel to which each mode belongs."""
     ends: list[NormalApproximation] = []
     is_new: list[np.ndarray] = []
     starts, first = find_starts(batch), None
@@ -148,7 +147,7 @@ def find_conditional_modes(
 
 
 def _starts(engine: CompiledModel, candidates: int) -> JitOnce:
-    """A program that ranks draws from the prior, and keeps the first `RANKS`."""
+    """Make the program that ranks prior draws by density and returns the first `RANKS`."""
     draws = engine.prior_draws(candidates).astype(np.float32)
 
     program = engine.single_program

@@ -1,4 +1,4 @@
-"""Batches of pixels: their readings, what is known of a fit, and compiled functions of them.
+"""Batches of pixels: readings, status codes, and compiled functions of many pixels.
 
 Some arrays differ between pixels, others are shared by all. A batch has a fixed number of pixels,
 so every batch of every image runs the same compiled program, which computes only as many of its
@@ -30,7 +30,7 @@ LANES = 16
 
 @dataclasses.dataclass(frozen=True)
 class ObservationBatch:
-    """Readings of many pixels: `batched` arrays begin with the pixel axis, `static` ones do not."""
+    """Readings of many pixels: `batched` arrays start with the pixel axis, `static` ones do not."""
 
     batched: Observations
     static: Observations
@@ -47,15 +47,15 @@ class ObservationBatch:
         return len(self.views)
 
     def take(self, index: np.ndarray) -> Observations:
-        """The batched arrays of some pixels, in that order."""
+        """Return the batched arrays of some pixels, in that order."""
         return jax.tree.map(lambda x: x[index], self.batched)
 
     def subset(self, index: np.ndarray) -> "ObservationBatch":
-        """Some of the pixels, in that order."""
+        """Return a batch of some of the pixels, in that order."""
         return ObservationBatch(self.take(index), self.static, self.views[index])
 
     def in_precision(self, dtype: DTypeLike) -> "ObservationBatch":
-        """The same readings in another floating type."""
+        """Convert the readings to another floating type."""
 
         def cast(x: np.ndarray) -> np.ndarray:
             return x.astype(dtype) if np.issubdtype(x.dtype, np.floating) else x
@@ -64,7 +64,7 @@ class ObservationBatch:
         return ObservationBatch(batched, static, self.views)
 
     def pixel(self, index: int = 0) -> Observations:
-        """One pixel as a capture of its own."""
+        """Return one pixel as a capture."""
         batched = jax.tree.map(lambda x: jnp.asarray(x[index]), self.batched)
         return eqx.combine(batched, jax.tree.map(jnp.asarray, self.static))
 
@@ -98,7 +98,7 @@ def batch_pixels(
 
 
 def cut(image: xr.Dataset, pixels: int) -> Iterator[dict[str, slice]]:
-    """Places of blocks that cover an image, row by row."""
+    """List the blocks that cover an image, row by row."""
     rows, columns = (image.sizes[dim] for dim in IMAGE)
     wide = min(columns, pixels)
     high = max(1, pixels // wide)
@@ -111,11 +111,11 @@ def cut(image: xr.Dataset, pixels: int) -> Iterator[dict[str, slice]]:
 
 
 MIN_VIEWS = 2
-"""Valid views without which a pixel is not fitted."""
+"""Fewest valid views with which a pixel is fitted."""
 
 
 class Status(enum.IntEnum):
-    """Status of a pixel; the last is the value of chunks that are not written.
+    """Status of a pixel; the last is the value in chunks that were not written.
 
     A contradicted pixel has a good posterior, and its readings speak against the model.
     """
@@ -130,7 +130,7 @@ class Status(enum.IntEnum):
 
 
 class MethodUsed(enum.IntEnum):
-    """The method by which the numbers of a pixel were found; `OTHER` is one of the user's own."""
+    """Method that determined the numbers of a pixel; `OTHER` is a user's own method."""
 
     NONE = 0
     LAPLACE = 1
@@ -144,7 +144,7 @@ class MethodUsed(enum.IntEnum):
 
 
 def batched(function: Callable, *, given: int = 0, lanes: int = LANES) -> JitOnce:
-    """A function of one pixel, mapped over a batch, compiled."""
+    """Compile a function of one pixel, mapped over a batch."""
 
     def mapped(over: Callable, *arguments: Any) -> Any:
         return over(functools.partial(function, *arguments[:given]), *arguments[given:])
@@ -153,7 +153,7 @@ def batched(function: Callable, *, given: int = 0, lanes: int = LANES) -> JitOnc
 
 
 def batched_lanes(function: Callable, *, given: int = 0, lanes: int = LANES) -> JitOnce:
-    """A function of as many pixels as there are lanes, compiled for a batch.
+    """Compile a function of `LANES` pixels for a batch.
 
     Its first argument maps a function of the observations and states of one pixel over them.
     """

@@ -1,4 +1,4 @@
-r"""Checks of a model that fits and maps share, as functions of arrays, and limits of their levels.
+r"""Checks of a model that fits and maps share, as functions of arrays, with their levels.
 
 A parameter at the value at which what it describes is absent or perfect is no conflict, however
 rarely the prior has it there: a body that sends no light is the simplest object there is. Its
@@ -18,33 +18,33 @@ from jaxtyping import Float
 from scipy import stats
 
 CAUTION = 0.02
-"""Probability, under a right model, that one check gives a caution or a problem."""
+"""Probability, under a correct model, that one check gives a caution or a problem."""
 
 PROBLEM = 0.004
-"""Probability, under a right model, that one check gives a problem."""
+"""Probability, under a correct model, that one check gives a problem."""
 
 NEAR_BOUND = 0.05
 """Width of the strip at a bound, as a share of the 95% interval."""
 
 MASS_AT_BOUND = 0.0475
-"""Share of the draws in that strip that counts: that of a uniform density over the interval."""
+"""Share of draws in that strip from which a bound is reported: that of a uniform density."""
 
 NOISE_FACTOR = "stokes_error_factor"
 
 LARGE_FACTOR = 3.0
-"""Stated errors that are exceeded by this factor, with probability 97.5%, give a caution."""
+"""Factor by which stated errors are exceeded, with probability 97.5%, in a caution."""
 
 CARRIES = 0.3
-"""Correlation with a material parameter from which another one is judged with it."""
+"""Smallest correlation with a material parameter at which a parameter is checked with it."""
 
 ANGLE_SCALES = (4.0, 15.0)
-"""Length scales of structure over directions, unit degree."""
+"""Length scales, in degrees, on which residuals are tested for structure."""
 
 
 def tail_scores(
     below: Float[np.ndarray, "... parameter"], end: Float[np.ndarray, " parameter"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Tail probabilities of the prior and their normal scores, (..., parameter).
+    """Return tail probabilities of the prior and their normal scores, (..., parameter).
 
     `below` is the prior probability below each posterior median; `end` says where the parameter is
     absent or perfect, -1 at the low end, 1 at the high end, 0 nowhere: that end is no tail.
@@ -59,7 +59,7 @@ def tail_scores(
 def prior_conflict(
     below: Float[np.ndarray, "... parameter"], end: Float[np.ndarray, " parameter"]
 ) -> np.ndarray:
-    """p-value of the smallest tail (Bonferroni) and of all tails together, for each row."""
+    """Return p-values of the smallest tail (Bonferroni) and of all tails jointly, by row."""
     tails, scores = tail_scores(below, end)
     farthest = tails.min(axis=-1) * tails.shape[-1]
     one_sided = int(np.sum(end != 0.0))
@@ -72,12 +72,12 @@ def prior_conflict(
 
 
 def _chi2_tail(squares: np.ndarray, degrees: int) -> np.ndarray:
-    """Probability above; without degrees of freedom all of it is at zero."""
+    """Return the upper tail of chi squared; zero degrees of freedom put all mass at zero."""
     return stats.chi2.sf(squares, degrees) if degrees else np.where(squares > 0.0, 0.0, 1.0)
 
 
 def level(p_value: float) -> str:
-    """The level of a check with this p-value."""
+    """Return the level of a check with this p-value."""
     if not math.isfinite(p_value):
         return "not computed"
     return "problem" if p_value < PROBLEM else "caution" if p_value < CAUTION else "passed"

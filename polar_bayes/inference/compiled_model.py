@@ -1,4 +1,4 @@
-"""A model compiled for a layout: its programs, for one capture or many side by side.
+"""A model compiled for a layout: programs for one capture, or for many in a batch.
 
 Programs of batches are made by functions `make(compiled_model, settings)` in the file of their
 algorithm. A model compiles each once and keeps it, so all captures of a layout share the programs.
@@ -24,12 +24,12 @@ from polar_bayes.numerics.fingerprint import fingerprint
 from polar_bayes.observation.data import Observations
 
 MOMENTS = 4000
-"""Draws by which the moments of priors are found."""
+"""Number of draws that determine the moments of priors."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CompiledModel:
-    """What fits of one model to captures of one layout have in common.
+    """The programs that fits of one model to captures of one layout share.
 
     `program` is the model in the precision of the fit; `layout` is a capture of that layout.
     """
@@ -49,12 +49,12 @@ class CompiledModel:
             return make_initializer(self.program, self.layout)
 
     def free(self, data: Observations) -> Observations:
-        """A capture with room for what is held; not one of groups that are fitted apart first."""
+        """Return a capture with NaN for parameters that may be held; unchanged if it has groups."""
         return data if data.leading else self.program.free(data)
 
     @functools.cached_property
     def single_program(self) -> Program:
-        """The same model in single precision."""
+        """Program of the model in single precision."""
         if self.precision == "single":
             return self.program
         with jax.enable_x64(False), TRACING_LOCK:
@@ -79,7 +79,7 @@ class CompiledModel:
 
     @functools.cached_property
     def parameter_axes(self) -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
-        """By parameter: names and lengths of the axes that it has in one pixel."""
+        """Names and lengths of each parameter's axes in one pixel, by parameter."""
         z = np.zeros(self.program.size, self.dtype)
         with jax.enable_x64(self.precision == "double"), TRACING_LOCK:
             names = jax.eval_shape(self.program.parameters, z, self.layout)
@@ -87,7 +87,7 @@ class CompiledModel:
         return {name: (tuple(dims[name]), shape_of(self.program, name)) for name in names}
 
     def prior_draws(self, count: int) -> np.ndarray:
-        """Draws from the prior, the starting points of mode searches. (draw, size)."""
+        """Return draws from the prior, at which mode searches start, (draw, size)."""
         # Moments need many, and a draw does not depend on how many there are: keys compile once.
         return self.made(_prior_draws, max(count, MOMENTS))[:count]
 
@@ -102,7 +102,7 @@ class CompiledModel:
 
     @property
     def prior_moments(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Mean and sd of every parameter before any reading, where they are finite."""
+        """Prior mean and sd of every parameter for which they are finite."""
         found = self.prior_parameters.items()
         moments = {name: (x.mean(axis=0), x.std(axis=0)) for name, x in found}
         return {name: two for name, two in moments.items() if np.isfinite(two).all()}
@@ -145,7 +145,7 @@ def compile_layout(
 
 
 def layout_key(request: Request, *further: object) -> str:
-    """A text that is the same for requests whose captures have one layout and one model."""
+    """Return a text that is equal for requests with the same model and the same layout."""
     layout = [
         (name, v.dims, v.shape, str(v.dtype)) for name, v in request.capture.variables.items()
     ]

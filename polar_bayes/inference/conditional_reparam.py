@@ -1,4 +1,4 @@
-r"""Coefficients of a linear term, standardized given all other coordinates.
+r"""Conditional standardization of the coefficients of a linear term.
 
 The weights w of a smooth discrepancy can imitate most of what the other parameters do to the
 readings. Each set of those parameters therefore has weights of its own, known to the accuracy of
@@ -73,12 +73,12 @@ class ConditionalReparam(AbstractDensity[ConditionalInputs]):
     def forward(
         self, x: Float[Array, " size"], given: ConditionalInputs
     ) -> tuple[Float[Array, " size"], Float[Array, ""]]:
-        """Coordinates of the program, and the log volume of the map."""
+        """Return the coordinates of the program, and the log volume of the map."""
         x, w, log_volume = self._moved(x, given)
         return x.at[self.coefficients].set(w), log_volume
 
     def backward(self, z: np.ndarray, data: Observations) -> np.ndarray:
-        """Coordinates x of vectors of the program, (row, size), their coefficients standard 0."""
+        """Return coordinates x of the program's vectors (row, size), standardized ones zero."""
         if self.sums is not None:
             z = in_blocks(self.sums.backward_of_block, (z,), data)
         x = np.array(z)
@@ -96,7 +96,7 @@ class ConditionalReparam(AbstractDensity[ConditionalInputs]):
     def inputs(
         self, mode: np.ndarray, covariance: np.ndarray, data: Observations
     ) -> ConditionalInputs:
-        """The map around a mode of the program, with the posterior covariance there."""
+        """Return the inputs of the map around a mode, with the posterior covariance there."""
         among = covariance[np.ix_(self.others, self.others)]
         across = covariance[np.ix_(self.coefficients, self.others)]
         slope = np.linalg.solve(among, across.T).T
@@ -115,7 +115,7 @@ class ConditionalReparam(AbstractDensity[ConditionalInputs]):
         return ConditionalInputs(data, *(jnp.asarray(part, dtype) for part in parts))
 
     def inputs_like(self, data: Observations) -> ConditionalInputs:
-        """Inputs of the shapes that `inputs` gives, for programs to be compiled."""
+        """Return inputs of the shapes that `inputs` returns, to compile programs early."""
         dtype, count = data.brightness.dtype, len(self.coefficients)
         others = jnp.zeros(len(self.others), dtype)
         slope = jnp.zeros((count, len(self.others)), dtype)
@@ -139,7 +139,7 @@ class ConditionalReparam(AbstractDensity[ConditionalInputs]):
         start: Float[Array, " coefficient"],
         given: ConditionalInputs,
     ) -> tuple[Float[Array, " coefficient"], Float[Array, "coefficient coefficient"]]:
-        """Mean of the coefficients given the others, and Cholesky factor of their precision."""
+        """Return conditional mean and Cholesky factor of the precision of the coefficients."""
         program = self.program
         sites = program.unravel(x)
 
@@ -165,7 +165,7 @@ class ConditionalReparam(AbstractDensity[ConditionalInputs]):
 
 
 def moments(distribution: dist.Distribution, reading: Array) -> tuple[Array, Array, Array]:
-    """Mean and variance of a reading and the reading, where they are normal if anything is."""
+    """Return mean, variance and value of a reading on the scale of its base distribution."""
     while isinstance(distribution, dist.MaskedDistribution | dist.TransformedDistribution):
         if isinstance(distribution, dist.TransformedDistribution):
             for transform in reversed(distribution.transforms):
@@ -175,7 +175,7 @@ def moments(distribution: dist.Distribution, reading: Array) -> tuple[Array, Arr
 
 
 def find_coefficients(program: Program, data: Observations) -> ConditionalReparam | None:
-    """The map over vectors with a normal prior that no plate repeats; None without any."""
+    """Return the map that standardizes vectors with a normal prior; None without any."""
     positions = program.positions
     names = tuple(
         name

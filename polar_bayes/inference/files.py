@@ -1,4 +1,4 @@
-"""The schema of results, and their netCDF files: one tree a file, whole or not at all.
+"""The schema of results, and their netCDF files, each of which holds one tree.
 
 A schema lists the groups, variables, attributes and provenance that this package reads, with the
 type of each. Everything else in a tree is ignored, so trees that ArviZ made, or that a user has
@@ -23,13 +23,13 @@ from polar_bayes.observation.data import ANGLES
 from polar_bayes.priors import short_numbers
 
 Problems = Iterator[tuple[str, str]]
-"""Where a tree departs from its schema, and what is wrong there."""
+"""Places at which a tree violates its schema, each with a description."""
 
 # --- JSON: provenance and attributes --------------------------------------------------------------
 
 
 class Leaf(NamedTuple):
-    """A type of JSON value: its name, and whether a value has it."""
+    """A type of JSON values: its name, and a test of values."""
 
     name: str
     holds: Callable[[Any], bool]
@@ -79,11 +79,11 @@ type Spec = Leaf | Mapping[str, Spec] | list[Spec]
 entry is the type of each item."""
 
 EACH = "*"
-"""Stands for every key of a mapping that the specification does not name."""
+"""Key that represents every key of a mapping that the specification does not name."""
 
 
 def _check_json(value: Any, spec: Spec, where: str) -> Problems:
-    """Where a JSON value departs from its specification."""
+    """Yield the places at which a JSON value violates its specification."""
     if isinstance(spec, Leaf):
         if not spec.holds(value):
             yield where, f"it is {value!r}, not {spec.name}"
@@ -116,11 +116,11 @@ RENAMED = {
     "k_hat": "pareto_k",
     "reference_effective_draws": "reference_ess",
 }
-"""Diagnostics by the names that version 0.1 wrote, and by those of today."""
+"""Names of diagnostics in version 0.1, and the present names."""
 
 
 def in_present_names[Result: (xr.DataTree, xr.Dataset)](result: Result) -> Result:
-    """A result that an earlier version may have written, its diagnostics by their present names."""
+    """Rename the diagnostics of a result that an earlier version may have written."""
     if isinstance(result, xr.DataTree):
         for node in result.subtree:
             node.dataset = _renamed(node.to_dataset())
@@ -152,7 +152,7 @@ _KIND_NAMES = {NUMBERS: "real numbers", FLAGS: "whole numbers or truth values", 
 
 
 class Like(NamedTuple):
-    """The variables of another group, each with endings of its name and the dims that they add."""
+    """The variables of another group, with suffixes of their names and the dims these add."""
 
     group: str
     endings: Mapping[str, tuple[str, ...]]
@@ -178,7 +178,7 @@ class Group:
     variable_attributes: Mapping[str, Spec] = dataclasses.field(default_factory=dict)
 
     def read(self, node: xr.DataTree) -> Variables:
-        """The variables that are read, and the coordinates that `variables` lists."""
+        """Return the variables that are read, and the coordinates that `variables` lists."""
         names = [*node.data_vars, *(key for key in self.variables if key in node.coords)]
         patterns = self.names or ("*",)
         return {
@@ -190,7 +190,7 @@ class Group:
     def check(
         self, variables: Variables, attributes: Mapping[Hashable, object], where: str
     ) -> Problems:
-        """Where a group departs from this schema."""
+        """Yield the places at which a group violates this schema."""
         yield from _check_json(attributes, self.attributes, where)
         for name in self.variables:
             if name not in variables:
@@ -218,7 +218,7 @@ class Group:
         yield from _check_json(variable.attrs, self.variable_attributes, where)
 
     def check_dims(self, own: Variables, read: Mapping[str, Variables], where: str) -> Problems:
-        """Where dims are not those that `like` and `inside` take from other groups."""
+        """Yield variables whose dims disagree with those of the groups `like` and `inside`."""
         for name, group in self.inside.items():
             for other, variable in read.get(group, {}).items() if name in own else ():
                 if not set(own[name].dims) <= set(variable.dims):
@@ -237,7 +237,7 @@ class Group:
 
 @dataclasses.dataclass(frozen=True)
 class Schema:
-    """What is read of a kind of tree."""
+    """The schema of one kind of tree."""
 
     kind: str
     made_by: str
@@ -246,7 +246,7 @@ class Schema:
     provenance: Mapping[str, Spec]
 
     def describes(self, tree: object) -> bool:
-        """Whether a tree has the required groups; a tree with a posterior is a fit only."""
+        """Return whether a tree has the required groups; only fits have a posterior."""
         if not isinstance(tree, xr.DataTree):
             return False
         required = {name for name, group in self.groups.items() if group.required}
@@ -254,7 +254,7 @@ class Schema:
         return required <= set(tree.children) and ("posterior" in required) == is_fit
 
     def check(self, tree: xr.DataTree, source: str) -> None:
-        """Raise a `FitError` where a tree departs from this schema."""
+        """Raise a `FitError` if a tree violates this schema."""
         if not self.describes(tree):
             hint = f"give the tree that {self.made_by} returned"
             raise FitError(f"it holds no {self.kind}", where=source, hint=hint)
@@ -279,7 +279,7 @@ class Schema:
         )
 
     def _check_lengths(self, read: Mapping[str, Variables]) -> Problems:
-        """Dims that groups share have one length, except chains and draws of untied groups."""
+        """Check that dims of groups have one length, except chains and draws of untied groups."""
         sizes: dict[str, tuple[str, int]] = {}
         for name, variables in read.items():
             for dim, size in {d: n for x in variables.values() for d, n in x.sizes.items()}.items():
@@ -291,7 +291,7 @@ class Schema:
 
 
 def _check_node(node: xr.DataTree, where: str) -> Problems:
-    """Groups that xarray itself cannot handle, as an edit that failed half-way leaves them."""
+    """Check for groups that xarray cannot handle, such as a failed edit leaves."""
     try:
         node.to_dataset()
     except ValueError as error:
@@ -302,7 +302,7 @@ def _check_node(node: xr.DataTree, where: str) -> Problems:
 
 
 def _check_labels(labeled: Mapping[str, xr.DataTree]) -> Problems:
-    """Dims that groups share have the same labels; wavelengths are lengths."""
+    """Check that dims of groups have the same labels, and that wavelengths are lengths."""
     seen: dict[Hashable, tuple[str, xr.Variable | None]] = {}
     for name, node in labeled.items():
         for dim in (dim for dim in node.dims if dim not in DRAWS):
@@ -332,7 +332,7 @@ COMMON_PROVENANCE: Mapping[str, Spec] = {
     "versions?": {EACH: ANY},
     "timings?": {EACH: FINITE},
 }
-"""Provenance that every kind of result may have."""
+"""Provenance that results of every kind may have."""
 
 _ALTERNATIVE: Mapping[str, Spec] = {
     **dict.fromkeys(("part", "alternative", "path", "failed?"), TEXT),
@@ -378,7 +378,7 @@ STATISTICS = (
     "reached_max_treedepth",
     "step_size",
 )
-"""Variables of `sample_stats` that are read; samplers of other packages have more."""
+"""Variables of `sample_stats` that are read; samplers of other packages store more."""
 
 _EFFECT, _PARAMETER, _ROW = ("effect",), ("parameter",), ("row",)
 COSTS = ("operations", "compile_seconds", "run_seconds")
@@ -479,12 +479,12 @@ FIT = Schema(
 
 
 def check_fit(result: xr.DataTree, source: str = "result") -> None:
-    """Raise a `FitError` where a tree is no fit, or its parts do not fit together."""
+    """Raise a `FitError` if a tree is not a fit or its parts are inconsistent."""
     FIT.check(result, source)
 
 
 def choice_sentences(result: xr.DataTree) -> list[str]:
-    """What a fit used and who chose it.
+    """State what a fit used, and who chose it.
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
@@ -523,7 +523,7 @@ def choice_sentences(result: xr.DataTree) -> list[str]:
 
 
 def auto_sentences(result: xr.DataTree) -> list[str]:
-    """What `method="auto"` tried, what it took, and why.
+    """State what `method="auto"` tried, what it selected, and why.
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
@@ -540,7 +540,7 @@ def auto_sentences(result: xr.DataTree) -> list[str]:
 
 
 def sentences_of_auto(provenance: Provenance) -> list[str]:
-    """What `method="auto"` tried, from the provenance of a fit that was checked."""
+    """State what `method="auto"` tried, from the provenance of a validated fit."""
     summary = provenance.get("auto")
     if not summary:
         return []
@@ -551,14 +551,14 @@ def sentences_of_auto(provenance: Provenance) -> list[str]:
             error = step.get("monte_carlo")
             within = "an unknown number of" if error is None else f"{error:.2g}"
             sentences.append(
-                f"{name} was taken: its means and standard deviations are expected within "
-                f"{within} posterior sd, and {summary['tolerance']:g} were asked for."
+                f"{name} was selected: its means and standard deviations are expected within "
+                f"{within} posterior sd; the tolerance is {summary['tolerance']:g}."
             )
         else:
-            sentences.append(f"{name} was not taken: {step['why']}.")
+            sentences.append(f"{name} was rejected: {step['why']}.")
     if not summary["met"]:
         sentences.append(
-            f"Nothing was good enough; these are the numbers of {summary['chosen']}, which came "
-            "nearest. Give more seconds or a larger tolerance, or doubt them."
+            f"No method met the tolerance; the numbers are those of {summary['chosen']}, which "
+            "came nearest. Give more seconds or a larger tolerance, or do not rely on them."
         )
     return sentences

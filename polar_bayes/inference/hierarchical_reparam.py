@@ -70,7 +70,7 @@ from polar_bayes.progress import Progress
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Groups:
-    """Positions in the flat vector of a program: of each group, (group, local), and of the rest."""
+    """Positions in the flat vector of a program: of the groups, (group, local), and of the rest."""
 
     axis: str
     local: np.ndarray
@@ -83,7 +83,7 @@ class Groups:
 
 
 def find_groups(program: Program, data: Observations) -> Groups | None:
-    """The groups along the only leading axis of a capture; None without one."""
+    """Return the groups along the only leading axis of a capture; None without one."""
     if len(data.leading) != 1:
         return None
     name, length = data.leading[0]
@@ -103,7 +103,7 @@ def find_groups(program: Program, data: Observations) -> Groups | None:
 
 
 def group_of(data: Observations, number: int) -> Observations:
-    """One group of a capture, as a capture with a leading axis of length 1."""
+    """Return one group of a capture, as a capture with a leading axis of length 1."""
     axis, length = data.dims[0]
 
     def cut(array: jax.Array) -> jax.Array:
@@ -214,7 +214,7 @@ class HierarchicalReparam(AbstractDensity[ReparamInputs]):
 
     @property
     def size(self) -> int:
-        """Length of w: common coordinates first, then one group after the other."""
+        """Length of w: common coordinates first, then each group's."""
         return self.program.size
 
     @override
@@ -235,7 +235,7 @@ class HierarchicalReparam(AbstractDensity[ReparamInputs]):
         return self._join(common, local), log_volume
 
     def inverse(self, z: Float[Array, " size"], given: ReparamInputs) -> Float[Array, " size"]:
-        """The coordinates w of a vector of the program."""
+        """Return the coordinates w of a vector of the program."""
         common, local = z[self.groups.common], z[self.groups.local]
         mean, lower = self._conditional(common, given)
         noise = jnp.einsum("gji,gj->gi", lower, local - mean)
@@ -248,7 +248,7 @@ class HierarchicalReparam(AbstractDensity[ReparamInputs]):
         local: Float[Array, "group local"],
         data: Observations,
     ) -> tuple[Float[Array, "group local"], Float[Array, "group local"]]:
-        """Gradient and curvature of minus the log prior of the groups, given common coordinates."""
+        """Return gradient and Hessian of the groups' minus log prior, given common coordinates."""
         # The coordinates of a group are taken as independent under their prior, which affects the
         # efficiency of sampling only.
 
@@ -259,17 +259,17 @@ class HierarchicalReparam(AbstractDensity[ReparamInputs]):
 
     @functools.cached_property
     def forward_jit(self) -> JitOnce:
-        """`forward` without the volume, compiled."""
+        """Compiled `forward`, without the volume."""
         return JitOnce(lambda w, given: self.forward(w, given)[0])
 
     @functools.cached_property
     def inverse_jit(self) -> JitOnce:
-        """`inverse`, compiled."""
+        """Compiled `inverse`."""
         return JitOnce(self.inverse)
 
     @functools.cached_property
     def forward_chains(self) -> JitOnce:
-        """`forward_jit` of chains of draws, (chain, draw, size), one after the other."""
+        """Apply `forward_jit` to chains of draws, (chain, draw, size), one after the other."""
 
         def chains(w: Array, given: ReparamInputs) -> Array:
             return jax.lax.map(
@@ -280,11 +280,11 @@ class HierarchicalReparam(AbstractDensity[ReparamInputs]):
 
     @functools.cached_property
     def population_jit(self) -> JitOnce:
-        """`population_derivatives`, compiled."""
+        """Compiled `population_derivatives`."""
         return JitOnce(self.population_derivatives)
 
     def _group_prior(self, z: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
-        """Minus the log prior density of the coordinates of all groups."""
+        """Return minus the log prior density of the coordinates of all groups."""
         terms, _ = self.program.log_terms(z, data)
         own = [n for n in self.program.supports if self.groups.axis in self.program.dims[n]]
         return -sum((terms[name] for name in own), jnp.zeros((), z.dtype))
@@ -311,10 +311,10 @@ class HierarchicalReparam(AbstractDensity[ReparamInputs]):
 
 
 TYPICAL_DRAWS = 200
-"""Prior draws whose median is the first value of the common coordinates."""
+"""Number of prior draws whose median is the first guess of the common coordinates."""
 
 FEWEST_STARTS, MOST_STARTS, ALL_STARTS = 4, 16, 256
-"""Starts of each group, and of all groups together where each may have more than the fewest."""
+"""Fewest and most starts of each group; number of starts that all groups share."""
 
 
 class GroupModes(NamedTuple):
@@ -392,7 +392,7 @@ class ReparamSearch:
         return given, NumpyPotential(self.reparam.value_and_gradient, given, self.dtype)
 
     def group_modes(self, key: Array) -> GroupModes:
-        """Search each group with common coordinates of its own, then with those of all groups."""
+        """Search each group with its own common coordinates, then with those of all groups."""
         groups = self.reparam.groups
         drawn = from_prior(self.reparam.program, key, TYPICAL_DRAWS, self.data)
         starts = int(np.clip(ALL_STARTS // groups.count, FEWEST_STARTS, MOST_STARTS))
@@ -444,13 +444,13 @@ class ReparamSearch:
         return found
 
     def population(self, common: np.ndarray, local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Gradient and curvature of minus the log prior of the groups, each (group, local)."""
+        """Return gradient and curvature of minus the groups' log prior, each (group, local)."""
         g, z = (jnp.asarray(x, self.dtype) for x in (common, local))
         gradient, curvature = self.reparam.population_jit(g, z, self.data)
         return np.asarray(gradient, float), np.asarray(curvature, float)
 
     def hyperparameters(self, z: np.ndarray) -> np.ndarray:
-        """True for common coordinates that the prior of a group depends on."""
+        """Return True for common coordinates on which the prior of a group depends."""
         common, local = z[self.reparam.groups.common], z[self.reparam.groups.local]
         before = np.stack(self.population(common, local))
         steps = 0.5 * np.eye(common.size)
@@ -459,7 +459,7 @@ class ReparamSearch:
 
 
 def _weighted_medians(values: np.ndarray, variances: np.ndarray) -> np.ndarray:
-    """Medians of the columns, weighted by inverse variance: outliers have no effect."""
+    """Return medians of columns, weighted by inverse variance, which outliers do not affect."""
     medians = []
     for column, variance in zip(values.T, variances.T, strict=True):
         order = np.argsort(column)
@@ -471,7 +471,7 @@ def _weighted_medians(values: np.ndarray, variances: np.ndarray) -> np.ndarray:
 def _common_factor(
     potential: ValueAndGradient, w: np.ndarray, factor: np.ndarray, dtype: np.dtype
 ) -> np.ndarray:
-    """Cholesky factor of the covariance of the common coordinates, from their Hessian."""
+    """Return a Cholesky factor of the common coordinates' covariance from their Hessian."""
     size = len(factor)
     if not size:
         return factor

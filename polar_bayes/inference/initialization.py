@@ -1,4 +1,4 @@
-"""Initialization: the modes of a posterior, and coordinates, starting points and metric from them.
+"""Initialization: posterior modes, and coordinates, starting points and metric from them.
 
 `JointInit` is for captures of one material: all coordinates are optimized together and sampled as
 they are. `HierarchicalInit` is for captures of many groups: each group is optimized by itself, and
@@ -58,7 +58,7 @@ from polar_bayes.progress import Progress
 STARTS = 16
 
 HEAVY_MODE = 0.01
-"""Laplace weight of a mode that chains must have visited."""
+"""Smallest Laplace weight of a mode that chains must visit."""
 
 Draws = tuple[np.ndarray, dict[str, np.ndarray]]
 """Unconstrained draws (chain, draw, size), and statistics, each (chain, draw)."""
@@ -74,7 +74,7 @@ class Target(NamedTuple):
     starts: np.ndarray
     metric: np.ndarray
     transform: Callable[[np.ndarray], np.ndarray] = lambda z: z
-    """From draws in the coordinates of the sampler to those of the program, (chain, draw, size)."""
+    """Function from the sampler's coordinates of draws to the program's, (chain, draw, size)."""
     acceptance: float = 0.9
     warmup: int = 300
 
@@ -105,11 +105,11 @@ class Coordinates:
     to_program: JitOnce | None = None
 
     def forward(self, x: np.ndarray) -> np.ndarray:
-        """Coordinates of the program, (..., size)."""
+        """Return coordinates of the program, (..., size)."""
         return self._forward(x.reshape(-1, x.shape[-1]))[0].reshape(x.shape)
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
-        """Log posterior densities of vectors, (draw, size)."""
+        """Return log posterior densities of vectors, (draw, size)."""
         z, log_volume = self._forward(x)
         return np.asarray(self.log_density_of(z) + log_volume, float)
 
@@ -120,7 +120,7 @@ class Coordinates:
 
 
 class AbstractInit(abc.ABC):
-    """Where draws start: what every method may ask of the modes, however they were found."""
+    """Result of a search for modes, with what methods need to start their draws."""
 
     metadata: Provenance
     """Number of starts, failures and weights, for the provenance."""
@@ -132,11 +132,11 @@ class AbstractInit(abc.ABC):
 
     @abc.abstractmethod
     def target(self, key: Array, chains: int) -> Target:
-        """The density for NUTS, with starting points and metric."""
+        """Return the density for NUTS, with starting points and metric."""
 
     @abc.abstractmethod
     def laplace(self, key: Array, chains: int, draws: int) -> Draws:
-        """Draws from the normal approximation at the mode of largest weight."""
+        """Draw from the normal approximation at the mode of largest weight."""
 
     def joint_modes(self, where: str) -> Modes:
         """The modes of all coordinates together; a `FitError` where groups have modes each."""
@@ -152,12 +152,12 @@ class AbstractInit(abc.ABC):
 
     @abc.abstractmethod
     def missed_mode_weight(self, z: np.ndarray) -> float:
-        """Weight of the heaviest mode to which some chain of draws never came nearest."""
+        """Return the weight of the heaviest mode that some chain never visited."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class JointInit(AbstractInit):
-    """One material: all coordinates together, and a dense metric from the Hessian at the mode."""
+    """Initialization of one material: joint coordinates, dense metric from the Hessian."""
 
     initializer: "JointInitializer"
     data: Observations
@@ -256,7 +256,7 @@ class JointInit(AbstractInit):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class HierarchicalInit(AbstractInit):
-    """Many groups: coordinates in which the posterior is close to standard normal."""
+    """Initialization of many groups, in coordinates with a nearly standard normal posterior."""
 
     reparam: HierarchicalReparam
     given: ReparamInputs
@@ -312,7 +312,7 @@ class HierarchicalInit(AbstractInit):
 
 
 def _weigh(potential: ValueAndGradient, z: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
-    """Log density and log importance weight of draws that are affine in standard normal noise."""
+    """Return log densities and log importance weights of affine maps of normal noise."""
     lp = -np.array([potential(draw)[0] for draw in z.reshape(-1, z.shape[-1])])
     lp = lp.reshape(z.shape[:2])
     return {"lp": lp, "log_weight": lp + 0.5 * np.sum(noise**2, axis=-1)}
@@ -322,26 +322,26 @@ def _weigh(potential: ValueAndGradient, z: np.ndarray, noise: np.ndarray) -> dic
 
 
 class AbstractInitializer(abc.ABC):
-    """The search for modes in all captures of one layout."""
+    """The search for modes of all captures of one layout."""
 
     is_joint: ClassVar[bool] = False
     """Whether all coordinates are optimized together, as those of pixels are."""
 
     @property
     def is_plain(self) -> bool:
-        """Whether draws are made in the coordinates of the program itself, as those of pixels."""
+        """True if draws are made in the coordinates of the program, as those of pixels are."""
         return False
 
     @abc.abstractmethod
     def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:
-        """The modes of one capture, searched from prior draws; a `FitError` where it has none."""
+        """Search the modes of one capture from prior draws; raise `FitError` without any."""
 
     def prepare(self, data: Observations) -> None:
-        """Begin to compile what `find` needs; nothing by default."""
+        """Begin to compile what `find` needs; the default does nothing."""
         del data
 
     def prepare_target(self, data: Observations) -> Target | None:
-        """A target of the shapes that the search will give, whose programs begin to compile.
+        """Return a target of the expected shapes, whose programs begin to compile.
 
         None where the shapes are not known, as by default.
         """
@@ -350,7 +350,7 @@ class AbstractInitializer(abc.ABC):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class JointInitializer(AbstractInitializer):
-    """For captures whose coordinates are optimized together."""
+    """Initializer of captures whose coordinates are optimized jointly."""
 
     program: Program
     reparam: ConditionalReparam | None
@@ -400,7 +400,7 @@ class JointInitializer(AbstractInitializer):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class HierarchicalInitializer(AbstractInitializer):
-    """For captures whose groups are optimized one by one."""
+    """Initializer of captures whose groups are optimized one by one."""
 
     group_model: GroupModel
     reparam: HierarchicalReparam
@@ -430,7 +430,7 @@ def make_initializer(program: Program, data: Observations) -> AbstractInitialize
 def _guide(
     program: Program, mode: Array, precision: Array, data: Observations
 ) -> tuple[Array, Array, Array]:
-    """Location and Cholesky factor of NumPyro's guide, and the order of its coordinates."""
+    """Return location, Cholesky factor and order of coordinates of NumPyro's guide."""
     # The guide orders sites as the model declares them, the program by name. The guide's own search
     # for a starting point is not needed, and compilation removes it.
     order = jnp.zeros(program.size, int)

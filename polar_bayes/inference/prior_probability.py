@@ -1,4 +1,4 @@
-"""Prior probability below values, of the default families without a program that is compiled."""
+"""Cumulative prior probabilities of the default families, without compiled programs."""
 
 import functools
 
@@ -12,7 +12,7 @@ from polar_bayes.priors import cast_prior
 
 
 def has_probabilities(prior: dist.Distribution) -> bool:
-    """Whether NumPyro has a cumulative distribution function of this prior."""
+    """Return whether NumPyro has a cumulative distribution function of this prior."""
     try:
         jax.eval_shape(lambda x: cast_prior(prior).cdf(x), np.zeros(prior.batch_shape))
     except NotImplementedError:  # NumPyro asks few distributions for one
@@ -22,7 +22,7 @@ def has_probabilities(prior: dist.Distribution) -> bool:
 
 @functools.singledispatch
 def probability_below(prior: dist.Distribution, x: np.ndarray) -> np.ndarray:
-    """The cumulative distribution function of a prior, in double precision; shape of `x`."""
+    """Return the prior's cumulative distribution function in double precision; shape of `x`."""
     with jax.enable_x64(True):
         if prior.batch_shape:
             return np.asarray(cast_prior(prior).cdf(x))

@@ -1,4 +1,4 @@
-"""One capture and the model that is fitted to it: what every method is given.
+"""One capture with its model, compiled: the argument of every method.
 
 All that is compiled belongs to the layout of the capture, and serves the next capture of that
 layout; `Problem` adds the readings and the posterior modes that were found for them.
@@ -26,7 +26,7 @@ from polar_bayes.progress import Progress, no_progress
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Problem:
-    """A posterior to draw from: one shape for one material and for many patches.
+    """A posterior to draw from, for one material or for many patches.
 
     `describe` tells what is estimated; `initialize` finds the modes; `log_density`, `constrain` and
     `predict` are functions of unconstrained vectors.
@@ -65,11 +65,11 @@ class Problem:
 
     @property
     def is_one_spectrum_point(self) -> bool:
-        """Whether the capture is of one material in one color."""
+        """True if the capture is of one material at one wavelength."""
         return all(name == "view" or length == 1 for name, length in self.data.dims)
 
     def initialize(self, progress: Progress = no_progress) -> AbstractInit:
-        """The posterior modes and what surrounds them, found once however many methods ask.
+        """Search the posterior modes at the first call, and return the result.
 
         Args:
             progress: Called with the name of a stage and the fraction of it that is done.
@@ -87,7 +87,7 @@ class Problem:
         return self._searched[0][0]
 
     def describe(self) -> pd.DataFrame:
-        """What is estimated, and from which readings.
+        """Describe what is estimated, and from which readings.
 
         Returns:
             A row for each parameter, derived ones included: its dims and their lengths, how many
@@ -117,7 +117,7 @@ class Problem:
     def log_density(
         self, z: Float[np.ndarray, "draw size"], data: Observations | None = None
     ) -> Float[np.ndarray, " draw"]:
-        """Log posterior density of unconstrained vectors, up to a constant.
+        """Return the log posterior density of unconstrained vectors, up to a constant.
 
         Args:
             z: Unconstrained vectors, shape (draw, size).
@@ -129,7 +129,7 @@ class Problem:
         return self.program.log_density(z.astype(self.dtype), self.data if data is None else data)
 
     def constrain(self, z: Float[np.ndarray, "chain draw size"]) -> Values:
-        """Parameters of draws, in their supports.
+        """Transform draws to parameters in their supports.
 
         Args:
             z: Unconstrained vectors, shape (chain, draw, size).
@@ -142,7 +142,7 @@ class Problem:
         return {name: x.reshape(*z.shape[:2], *x.shape[2:]) for name, x in found.items()}
 
     def hold(self, values: Mapping[str, ArrayLike]) -> "Problem":
-        """The same problem with some parameters known: it compiles nothing.
+        """Return the problem with some parameters fixed to values; nothing is compiled.
 
         Args:
             values: By latent site, in its support or at the end of it; NaN where an entry is to be
@@ -172,15 +172,15 @@ class Problem:
         return dataclasses.replace(self, data=dataclasses.replace(self.data, held=held))
 
     def prepare_search(self) -> None:
-        """Begin to compile what `initialize` needs, in parallel with whatever follows."""
+        """Begin to compile what `initialize` needs, in another thread."""
         self.compiled_model.initializer.prepare(self.data)
 
     def prepare_predictions(self) -> None:
-        """Begin to compile what `predict` needs, in parallel with whatever follows."""
+        """Begin to compile what `predict` needs, in another thread."""
         self.program.begin_described(self.data)
 
     def predict(self, key: Array, z: Float[np.ndarray, "chain draw size"]) -> Draw:
-        """Parameters, densities and predicted readings of draws.
+        """Return parameters, densities and predicted readings of draws.
 
         Args:
             key: Random key of the predicted readings.
@@ -196,7 +196,7 @@ class Problem:
 
 
 def observe_request(request: Request, *, padded: bool = False) -> Observations:
-    """The capture of a request, in its precision."""
+    """Return the capture of a request as arrays in its precision."""
     limit = request.largest_view_zenith
     data = observe(request.capture, largest_view_zenith=limit, padded=padded)
     return data.in_single_precision() if request.precision == "single" else data
@@ -210,6 +210,6 @@ def compile_request(request: Request) -> tuple[CompiledModel, Observations]:
 
 
 def make_problem(request: Request, key: Array, start_time: float | None = None) -> Problem:
-    """A request's posterior, ready for any method; compiled where its layout is new."""
+    """Make the problem of a request; only a new layout is compiled."""
     begun = time.perf_counter() if start_time is None else start_time
     return Problem(*compile_request(request), key, begun)

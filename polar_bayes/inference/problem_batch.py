@@ -1,4 +1,4 @@
-"""Captures of one layout that are fitted together, and what methods find for them."""
+"""Captures of one layout that are fitted together, and the results of methods for them."""
 
 import contextlib
 import dataclasses
@@ -49,7 +49,7 @@ class ProblemBatch:
         return len(self.at)
 
     def subset(self, index: np.ndarray) -> "ProblemBatch":
-        """Some of the captures, in that order."""
+        """Return a batch of some of the captures, in that order."""
         pixels, keys, at = self.pixels.subset(index), self.keys[index], self.at[index]
         return dataclasses.replace(self, pixels=pixels, keys=keys, at=at)
 
@@ -111,14 +111,14 @@ class ProblemBatch:
 def problem_batch(
     engine: CompiledModel, pixels: ObservationBatch, numbers: np.ndarray, seed: int
 ) -> ProblemBatch:
-    """Captures whose random keys depend on the number of each alone."""
+    """Make a batch of captures, each with a random key that depends on its number alone."""
     return ProblemBatch(
         engine, pixels, random_keys(seed, numbers), np.arange(len(pixels)), seed=seed
     )
 
 
 class BatchDraws(NamedTuple):
-    """What a method found for some captures of a batch: rows of arrays, or one value for all.
+    """Results of a method for some captures of a batch: one row each, or one value for all.
 
     `mode` is a mode of each capture and a root of the covariance there; `draws` is empty where
     there is no answer. What is found later for a capture replaces what was found before.
@@ -149,7 +149,7 @@ class Outcome:
         self.status = np.full(count, status, np.int8)
 
     def put(self, found: BatchDraws) -> None:
-        """Enter what was found for some captures."""
+        """Enter the results of some captures."""
         at = found.at
         self.ess[at], self.method[at] = found.ess, found.method
         self.status[at] = found.status
@@ -159,7 +159,7 @@ class Outcome:
 
 
 def random_keys(seed: int, numbers: np.ndarray) -> np.ndarray:
-    """Random keys that depend on the number of each capture alone, as arrays."""
+    """Return random keys, as arrays, that depend on the number of each capture alone."""
     base = jax.random.key(seed)
     keys = jax.vmap(lambda number: jax.random.fold_in(base, number))(numbers.astype(np.uint32))
     return np.asarray(jax.random.key_data(keys))

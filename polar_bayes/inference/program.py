@@ -33,10 +33,10 @@ from polar_bayes.priors import PriorTable, check_support
 Model = Callable[[Observations], None]
 
 BLOCK = 500
-"""Draws that one call describes or constrains: one compiled program serves any number."""
+"""Number of draws that one call describes or constrains; the last block is padded."""
 
 THREADS = 2
-"""That run such calls."""
+"""Number of threads that run such calls."""
 
 Values = Mapping[str, AnyArray]
 
@@ -46,7 +46,7 @@ Sites = dict[str, Site]
 
 
 class Draw(NamedTuple):
-    """Values of one posterior draw, by site name; or of a stack of draws, as NumPy arrays."""
+    """Values of one posterior draw by site name, or of a stack of draws as NumPy arrays."""
 
     parameters: Values
     coordinates: Values
@@ -112,15 +112,15 @@ class Program(AbstractDensity[Observations]):
         return -_total(self._log_terms(self.model, sites, data)[0], data)
 
     def prior_potential(self, z: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
-        """The potential without the likelihood."""
+        """Return the potential without the likelihood."""
         return -_total(self._log_terms(self.prior, self.unravel(z), data)[0], data)
 
     def constrain(self, z: Float[Array, " size"]) -> dict[str, Array]:
-        """The latent sites in their supports."""
+        """Return the latent sites in their supports."""
         return self._constrain(self.unravel(z))
 
     def unconstrain(self, values: Mapping[str, Array]) -> Float[Array, " size"]:
-        """The vector of the latent sites in their supports, as `constrain` undoes it."""
+        """Return the vector of latent sites in their supports: the inverse of `constrain`."""
         supports = self.supports.items()
         return ravel_pytree({n: dist.biject_to(s).inv(values[n]) for n, s in supports})[0]
 
@@ -140,7 +140,7 @@ class Program(AbstractDensity[Observations]):
     def log_terms(
         self, z: Float[Array, " size"], data: Observations
     ) -> tuple[dict[str, Array], Sites]:
-        """The log density by site, with the log volume of its coordinates; the trace of the model.
+        """Return the log density by site, with log volumes, and the trace of the model.
 
         The coordinate of what is held has a standard normal density, and its prior none.
         """
@@ -164,22 +164,22 @@ class Program(AbstractDensity[Observations]):
         return terms, trace
 
     def free(self, data: Observations) -> Observations:
-        """The data with room for what is held, and nothing held; programs are those of `hold`."""
+        """Return data with NaN for all parameters that may be held; `hold` shares its programs."""
         dtype = data.brightness.dtype
         held = {n: np.full(x.shape, np.nan, dtype) for n, x in self.latent_shapes.items()}
         return dataclasses.replace(data, held=jax.device_put(held))
 
     @functools.cached_property
     def latent_shapes(self) -> dict[str, jax.ShapeDtypeStruct]:
-        """Of the latent sites in their supports."""
+        """Shapes of the latent sites in their supports."""
         return jax.eval_shape(self.constrain, self._vector)
 
     def trace(self, z: Float[Array, " size"], data: Observations) -> dict[str, dict]:
-        """The sites of the model at an unconstrained vector."""
+        """Return the sites of the model at an unconstrained vector."""
         return self.trace_at(self.unravel(z), data)
 
     def trace_at(self, sites: dict[str, Array], data: Observations) -> dict[str, dict]:
-        """The same of the unconstrained latent sites by name."""
+        """Return the sites of the model at unconstrained latent sites by name."""
         return self._trace(self.model, sites, data)
 
     def _trace(self, model: Model, sites: dict[str, Array], data: Observations) -> dict[str, dict]:
@@ -187,13 +187,13 @@ class Program(AbstractDensity[Observations]):
         return _trace(handlers.substitute(model, data=values), jax.random.key(0), data)
 
     def parameters(self, z: Float[Array, " size"], data: Observations) -> dict[str, Array]:
-        """The parameters: latent sites that are not auxiliary, and what derives from them."""
+        """Return latent sites that are not auxiliary, and what derives from them."""
         return self._parameters(self._trace(self.prior, self.unravel(z), data))
 
     def parameters_and_potential(
         self, z: Float[Array, " size"], data: Observations
     ) -> tuple[dict[str, Array], Float[Array, ""]]:
-        """Both, by one trace of the model."""
+        """Return parameters and potential from a single trace of the model."""
         terms, trace = self.log_terms(z, data)
         return self._parameters(trace), -_total(terms, data)
 
@@ -202,7 +202,7 @@ class Program(AbstractDensity[Observations]):
         return {name: trace[name]["value"] for name in names}
 
     def from_prior(self, key: Array, data: Observations) -> Float[Array, " size"]:
-        """An unconstrained vector drawn from the prior."""
+        """Draw an unconstrained vector from the prior."""
         trace = _trace(self.prior, key, data)
         return self.unconstrain({name: trace[name]["value"] for name in self.supports})
 
@@ -213,7 +213,7 @@ class Program(AbstractDensity[Observations]):
         data: Observations,
         predicts: Array | bool = True,
     ) -> Draw:
-        """Parameters, densities and predicted readings of one draw, 0 where it predicts none."""
+        """Return parameters, densities and readings of a draw; zeros if readings are not wanted."""
         seeded = handlers.seed(self.model, key)
         terms, trace = self._log_terms(seeded, self.unravel(z), data)
         keys = dict(zip(self.observed, jax.random.split(key, len(self.observed)), strict=True))
@@ -245,7 +245,7 @@ class Program(AbstractDensity[Observations]):
         )
 
     def residuals(self, z: Float[Array, " size"], data: Observations) -> dict[str, Array]:
-        """Reading minus noise-free reading of every observed site; 0 where not valid."""
+        """Return readings minus noise-free readings of every observed site; 0 if not valid."""
         trace = self.trace(z, data)
         return {
             name: jnp.where(data.valid, trace[name]["value"] - noise_free(trace, name), 0.0)
@@ -254,7 +254,7 @@ class Program(AbstractDensity[Observations]):
 
     @functools.cached_property
     def drawn_from_prior(self) -> JitOnce:
-        """Vectors drawn from the prior, compiled: one for each of the first `count` keys."""
+        """Compiled `from_prior` for the first `count` of many keys."""
         # The others are zero, so that one program serves any count.
 
         def draw(keys: Array, count: int, data: Observations) -> Array:
@@ -268,7 +268,7 @@ class Program(AbstractDensity[Observations]):
 
     @functools.cached_property
     def described(self) -> JitOnce:
-        """`describe` of many draws, compiled; keys as the data that they hold, (draw, ...)."""
+        """Compiled `describe` of many draws; keys are given as their data, (draw, ...)."""
 
         def describe(keys: Array, predicts: Array, z: Array, data: Observations) -> Draw:
             rows = jax.random.wrap_key_data(keys), predicts, z
@@ -286,7 +286,7 @@ class Program(AbstractDensity[Observations]):
         )
 
     def log_density(self, z: np.ndarray, data: Observations) -> np.ndarray:
-        """Log posterior densities of vectors, (draw, size); minus infinity where there is none."""
+        """Return log posterior densities of vectors (draw, size); minus infinity for NaN."""
         like = _keys_like(len(z))
         rows = np.zeros(like.shape, like.dtype), np.zeros(len(z), bool), z
         found = in_blocks(self.described, rows, data)
@@ -294,7 +294,7 @@ class Program(AbstractDensity[Observations]):
 
     @functools.cached_property
     def evaluated(self) -> JitOnce:
-        """Potentials and parameters of some vectors, (row, size), compiled."""
+        """Compiled potentials and parameters of vectors, (row, size)."""
 
         def evaluate(z: Array, data: Observations) -> tuple[Array, dict[str, Array]]:
             return jax.lax.map(lambda z: self.parameters_and_potential(z, data)[::-1], z)
@@ -303,7 +303,7 @@ class Program(AbstractDensity[Observations]):
 
     @functools.cached_property
     def parameters_of_chains(self) -> JitOnce:
-        """`parameters` of chains of draws, (chain, draw, size), compiled."""
+        """Compiled `parameters` of chains of draws, (chain, draw, size)."""
         over_draws = jax.vmap(self.parameters, in_axes=(0, None))
         return self.once("parameters_of_chains", jax.vmap(over_draws, in_axes=(0, None)))
 
@@ -318,20 +318,20 @@ def _total(terms: Mapping[str, Array], data: Observations) -> Array:
 
 
 def _with_held(values: dict[str, Array], data: Observations) -> dict[str, Array]:
-    """Latent sites in their supports, those that are held at their values."""
+    """Replace held latent sites by their values."""
     held = {n: jnp.where(jnp.isnan(x), values[n], x) for n, x in data.held.items()}
     return values | held
 
 
 def _all_of(mask: Array, like: Array) -> Array:
-    """A mask of the entries of a site as one of its log density, whose event axes are summed."""
+    """Reduce a mask of a site to the shape of its log density, without event axes."""
     if mask.shape == like.shape:
         return mask
     return jnp.all(mask, axis=tuple(range(like.ndim, mask.ndim)))
 
 
 def in_blocks(function: JitOnce, rows: tuple[np.ndarray, ...], given: Any) -> Any:
-    """What a function that is compiled for a block of rows gives for any number of them."""
+    """Call a function that is compiled for a block of rows on any number of rows."""
     double, device = rows[-1].dtype == np.float64, jax.config.jax_default_device
 
     def of_block(index: np.ndarray) -> Any:
@@ -359,11 +359,11 @@ def raveled(like: dict[str, jax.ShapeDtypeStruct]) -> tuple[jax.ShapeDtypeStruct
 
 
 class _EndedError(BaseException):
-    """Ends a model; no handler of errors in it is to see this."""
+    """Ends a model; a base exception, so that no handler in the model catches it."""
 
 
 class _UpTo(Messenger):
-    """Ends a model at the last of some sites, before it computes what comes after them."""
+    """Ends a model at the last of some sites, so that later sites are not computed."""
 
     def __init__(self, sites: Iterable[str]) -> None:
         super().__init__()
@@ -377,7 +377,7 @@ class _UpTo(Messenger):
 
 
 def _run_up_to(data: Observations, model: Model, sites: frozenset[str]) -> None:
-    """A model up to the last of some sites."""
+    """Run a model up to the last of some sites."""
     with contextlib.suppress(_EndedError), _UpTo(sites):
         model(data)
 
@@ -423,7 +423,7 @@ def compile_program(model: Model, data: Observations) -> Program:
 
 
 def places(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
-    """By name, the indices of arrays of these shapes in the vector that `ravel_pytree` makes."""
+    """Return indices of arrays of these shapes in the vector of `ravel_pytree`, by name."""
     found, begin = {}, 0
     for name in sorted(shapes):
         end = begin + math.prod(shapes[name])
@@ -432,23 +432,23 @@ def places(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
 
 
 def is_auxiliary(site: Site) -> bool:
-    """True for a latent site with `infer={"auxiliary": True}`: a coordinate, not a parameter."""
+    """Return True for a latent site with `infer={"auxiliary": True}`: no parameter."""
     return bool(site["infer"].get("auxiliary", False))
 
 
 def _is_summed(site: Site) -> bool:
-    """True for one number with `infer={"summed": True}`: readings determine the sum of such."""
+    """Return True for a scalar with `infer={"summed": True}`: readings determine a sum."""
     return bool(site["infer"].get("summed", False)) and not np.shape(site["value"])
 
 
 def noise_free(trace: dict, name: str) -> Array:
-    """The noise-free reading: the site `<name>_mean`, or else the mean of the likelihood."""
+    """Return the noise-free reading: site `<name>_mean`, or the mean of the likelihood."""
     site = trace.get(f"{name}_mean")
     return site["value"] if site is not None else trace[name]["fn"].mean
 
 
 def family_of(distribution: dist.Distribution) -> str:
-    """The name of a distribution's class, without the wrappers that plates add."""
+    """Return the name of a distribution's class, without the wrappers of plates."""
     while isinstance(distribution, dist.Independent | dist.ExpandedDistribution):
         distribution = distribution.base_dist
     return type(distribution).__name__
@@ -461,7 +461,7 @@ def _trace(model: Callable, key: Array, data: Observations, **arguments: object)
 def _abstract_sites(
     model: Callable, data: Observations, **arguments: object
 ) -> tuple[Sites, Sites, Sites]:
-    """All sites of a model, the sampled ones, and of these the latent ones; nothing is computed."""
+    """Return all sites, the sampled ones, and the latent ones among these, abstractly."""
     sites: Sites = {}
     jax.eval_shape(
         lambda data: sites.update(_trace(model, jax.random.key(0), data, **arguments)), data
@@ -471,7 +471,7 @@ def _abstract_sites(
 
 
 def _event_shape(site: dict) -> tuple[int, ...]:
-    """The axes of a deterministic site that no plate added."""
+    """Return the axes of a deterministic site that no plate added."""
     repeated = math.prod(frame.size for frame in site["cond_indep_stack"])
     shape = tuple(site["value"].shape)
     if math.prod(shape) == repeated:
@@ -484,7 +484,7 @@ def _event_shape(site: dict) -> tuple[int, ...]:
 
 
 class ModelInfo(NamedTuple):
-    """Priors that a model reads, priors that it declares, and sites that it holds fixed."""
+    """Priors that a model reads, priors that it declares, and sites that it fixes."""
 
     priors: tuple[str, ...]
     declared: dict[str, str]
@@ -518,7 +518,7 @@ def inspect_model(parts: ModelParts, data: Observations) -> ModelInfo:
 
 
 def _check_handlers(model: Callable, sites: tuple[str, ...]) -> None:
-    """`substitute` and `do` hold a value in simulations, but not while a posterior is sampled."""
+    """Refuse `substitute` and `do`, which fix values in simulations but not in fits."""
     while isinstance(model, Messenger):
         held = [name for name in getattr(model, "data", None) or {} if name in sites]
         if isinstance(model, handlers.substitute | handlers.do) and held:
@@ -542,7 +542,7 @@ def _check_site(name: str, distribution: dist.Distribution) -> None:
 
 
 def _check_readings(sampled: Mapping[str, dict], data: Observations) -> None:
-    """Every model must observe a reading, and draw none."""
+    """Refuse a model that observes no reading, or that draws one."""
     drawn = [n for n in data.readings if n in sampled and not sampled[n]["is_observed"]]
     if drawn:
         raise FitError(
@@ -559,16 +559,16 @@ def _check_readings(sampled: Mapping[str, dict], data: Observations) -> None:
 
 
 KEYS = 1 << 15
-"""The key of a draw depends on its index alone, so one round number serves any number of draws."""
+"""Number of keys that are made at once; each depends on its index alone."""
 
 
 def keys_of_draws(key: Array, draws: int) -> np.ndarray:
-    """A key for each draw, as numbers."""
+    """Return a key for each draw, as numbers."""
     return np.asarray(jax.random.key_data(jax.random.split(key, KEYS * -(-draws // KEYS))))[:draws]
 
 
 def split_key(key: Array) -> tuple[Array, Array]:
-    """Two keys, by one program."""
+    """Split a key in two by one compiled program."""
     return compiled(_split)(key)
 
 
@@ -578,13 +578,13 @@ def _split(key: Array) -> tuple[Array, Array]:
 
 
 def first_key() -> Array:
-    """A key of zeros, by no program."""
+    """Return a key of zeros without compiling anything."""
     like = _keys_like(1)
     return jax.random.wrap_key_data(jax.device_put(np.zeros(like.shape[1:], like.dtype)))
 
 
 def _keys_like(draws: int) -> jax.ShapeDtypeStruct:
-    """What `keys_of_draws` gives, without keys."""
+    """Return the shape and type of `keys_of_draws`."""
     return jax.eval_shape(lambda: jax.random.key_data(jax.random.split(jax.random.key(0), draws)))
 
 
@@ -594,7 +594,7 @@ def begin_from_prior(program: Program, data: Observations) -> None:
 
 
 def from_prior(program: Program, key: Array, draws: int, data: Observations) -> np.ndarray:
-    """Unconstrained vectors drawn from the prior; one compiled program serves any number."""
+    """Draw unconstrained vectors from the prior; one compiled program serves any number."""
     keys = keys_of_draws(key, draws)
 
     def drawn(index: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What a caller asks to be fitted, checked and with every default filled in."""
+"""Requests: the arguments of a fit, checked and with every default filled in."""
 
 import dataclasses
 import functools
@@ -58,7 +58,7 @@ class Request(ModelParts):
     """Parameters of the set-up that the pixels of an image share by default."""
 
     def describe(self) -> Provenance:
-        """The request in what JSON can hold, for the provenance of a result."""
+        """Describe the request in types of JSON, for the provenance of a result."""
         return {
             "model": self.model_name,
             "scene": self.scene_name,
@@ -83,7 +83,7 @@ def resolve(
     known: Mapping[str, float] | None = None,
     is_perfect: bool = False,
 ) -> Request:
-    """Check what the caller asked for, and fill in every default.
+    """Check the arguments of the caller, and fill in every default.
 
     The set-up is known to standard uncertainties, which `known` replaces, or perfectly.
     """
@@ -162,7 +162,7 @@ def _check_settings(limit: float, precision: str, seed: int) -> None:
 
 
 def _find_scene(scene: object, capture: xr.Dataset) -> tuple[Setup, str]:
-    """The set-up that a caller gives, by name or as it is, and its name."""
+    """Return the set-up of the caller, given by name or value, and its name."""
     if isinstance(scene, str):
         return find_setup(scene), scene
     if isinstance(scene, Setup):
@@ -171,12 +171,12 @@ def _find_scene(scene: object, capture: xr.Dataset) -> tuple[Setup, str]:
 
 
 def _usual_links(capture: xr.Dataset, setup: Setup) -> dict[str, AbstractLink]:
-    """The links of a set-up for the variables that a capture holds."""
+    """Return a set-up's links for the variables of a capture."""
     return {name: link for name, link in setup.links.items() if name in capture}
 
 
 def _are_same(prior: object, usual: object) -> bool:
-    """Whether a prior is the default one, as where a scene file lists every prior."""
+    """Return whether a prior equals the default, as in scene files that list every prior."""
     if not isinstance(prior, dist.Distribution) or not isinstance(usual, dist.Distribution):
         return False
     # A class of the user's own may have any name.
@@ -193,7 +193,7 @@ def _find_model(name: object) -> Callable:
 
 
 def _name_of(model: Callable) -> str:
-    """The name of a model of the user's own; handlers around it are part of the name."""
+    """Return the name of the user's model, including handlers around it."""
     if isinstance(model, functools.partial):
         return _name_of(model.func)
     inner = getattr(model, "fn", None) if isinstance(model, Messenger) else None
@@ -203,7 +203,7 @@ def _name_of(model: Callable) -> str:
 
 
 def _setup_around(scene: object, capture: xr.Dataset) -> Setup:
-    """A scene of the user's own, with the links and limits of the capture's set-up."""
+    """Return the user's scene with the links and limits of the capture's set-up."""
     if not isinstance(scene, Scene):
         raise FitError(
             f"a {type(scene).__name__} is not a scene",
@@ -217,7 +217,7 @@ def _setup_around(scene: object, capture: xr.Dataset) -> Setup:
 def _choose_links(
     capture: xr.Dataset, setup: Setup, links: AbstractLink | Mapping[str, AbstractLink] | None
 ) -> dict[str, AbstractLink]:
-    """The links of the variables that the capture holds."""
+    """Return links for the variables of the capture."""
     if links is None:
         chosen = _usual_links(capture, setup)
         wanted = list(setup.links)
@@ -272,7 +272,7 @@ def _check_link(name: str, link: object, capture: xr.Dataset) -> None:
 
 
 def _check_views(capture: xr.Dataset, limit: float) -> None:
-    """One view cannot separate four parameters, whatever the prior."""
+    """Refuse captures with a single view, which cannot separate four parameters."""
     data_valid = capture.get("valid", xr.DataArray(True)) & (capture["view_zenith"] <= limit)
     per_fit = data_valid.broadcast_like(capture["view_zenith"])
     used = int(per_fit.any([d for d in per_fit.dims if d != "view"]).sum())

@@ -22,7 +22,7 @@ from polar_bayes.priors import RANGES
 PROVENANCE = "polar_bayes"
 
 CENTRAL_95 = (0.025, 0.975)
-"""Probabilities of the ends of the equal-tailed 95% interval."""
+"""Quantile levels of the equal-tailed 95% interval."""
 
 type Provenance = dict[str, Any]
 """What a result says of how it was made, as JSON holds it."""
@@ -38,7 +38,7 @@ def assemble(
     comparisons: Mapping[str, xr.Dataset],
     provenance: Mapping[str, object],
 ) -> xr.DataTree:
-    """Draws, data and provenance as one tree."""
+    """Combine draws, data and provenance into one tree."""
     groups: dict[str, dict[str, np.ndarray]] = {
         "posterior": _shaped(program, posterior.parameters),
         "sample_stats": {name: np.asarray(x) for name, x in sample_stats.items()},
@@ -71,7 +71,7 @@ def assemble(
 
 
 def capture_of(result: xr.DataTree) -> xr.Dataset:
-    """The capture of a fit, with the variables that were fitted."""
+    """Return the capture of a fit, with the variables that were fitted."""
     parts = (result[name].to_dataset() for name in ("observed_data", "constant_data"))
     capture = xr.merge(parts, join="exact", compat="equals")
     of_others = [  # errors of readings that were not fitted
@@ -85,14 +85,14 @@ def capture_of(result: xr.DataTree) -> xr.Dataset:
 
 
 def attributes_of(name: str) -> dict[str, str]:
-    """Meaning, unit and symbol of a parameter, as attributes of its variable."""
+    """Return meaning, unit and symbol of a parameter as attributes of its variable."""
     symbol, meaning, unit = notation(name)
     known = {"long_name": meaning, "units": unit}
     return known | {"symbol": symbol} if symbol else known
 
 
 def provenance_of(result: xr.DataTree | xr.Dataset) -> Provenance:
-    """How a result was made; null entries are left out."""
+    """Return the provenance of a result, without null entries."""
     try:
         found = json.loads(result.attrs.get(PROVENANCE, "{}"))
     except (TypeError, ValueError, RecursionError):
@@ -107,7 +107,7 @@ def provenance_of(result: xr.DataTree | xr.Dataset) -> Provenance:
 
 
 def bounds_of(provenance: Provenance, name: str) -> tuple[float, float]:
-    """Support of the prior of a parameter."""
+    """Return the support of the prior of a parameter."""
     bounds = (provenance.get("bounds") or {}).get(name)
     if bounds is None:
         return RANGES.get(name, (-math.inf, math.inf))
@@ -116,13 +116,13 @@ def bounds_of(provenance: Provenance, name: str) -> tuple[float, float]:
 
 
 def posterior_of(program: Program, parameters: Values) -> xr.Dataset:
-    """The group `posterior` of a fit without any other group."""
+    """Return the group `posterior` of a fit without any other group."""
     tree = from_dict({"posterior": _shaped(program, parameters)}, dims=dims_of(program))
     return tree["posterior"].to_dataset()
 
 
 def dims_of(program: Program) -> dict[str, list[str]]:
-    """Axes of every site: those of its plates, then those of its own event."""
+    """Return the axes of every site: those of its plates, then those of its event."""
     return {
         name: [*program.dims[name], *(f"{name}_{i}" for i, _ in enumerate(program.events[name]))]
         for name in program.dims
@@ -130,7 +130,7 @@ def dims_of(program: Program) -> dict[str, list[str]]:
 
 
 def shape_of(program: Program, name: str) -> tuple[int, ...]:
-    """Lengths of the axes of a site, without the axes of length 1 that plates may add."""
+    """Return lengths of the axes of a site, without axes of length 1 from plates."""
     return (*(program.plates[dim] for dim in program.dims[name]), *program.events[name])
 
 
@@ -142,12 +142,12 @@ def _shaped(program: Program, values: Values) -> dict[str, np.ndarray]:
 
 
 def _measured(readings: Values, data: Observations) -> dict[str, np.ndarray]:
-    """Readings of draws, or their densities, without those of padding."""
+    """Return readings of draws, or their densities, without padding."""
     return {name: np.asarray(value)[..., data.measured] for name, value in readings.items()}
 
 
 def _in_own_unit(readings: Values, data: Observations) -> dict[str, np.ndarray]:
-    """Readings of draws in the unit of the capture."""
+    """Return readings of draws in the unit of the capture."""
     unit = {"intensity": float(data.intensity_unit)}
     return {name: x * unit.get(name, 1.0) for name, x in _measured(readings, data).items()}
 
@@ -155,7 +155,7 @@ def _in_own_unit(readings: Values, data: Observations) -> dict[str, np.ndarray]:
 def _data_groups(
     program: Program, capture: xr.Dataset, data: Observations, coords: Mapping[str, np.ndarray]
 ) -> dict[str, xr.Dataset]:
-    """Readings that were fitted, and what the model was given: geometry, errors, flags, truth."""
+    """Return fitted readings, and the model's inputs: geometry, errors, flags, truth."""
     order = [dim for dim, _ in data.dims]
     bare = capture.drop_vars(capture.coords)
     valid, saturated = (

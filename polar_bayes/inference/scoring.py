@@ -23,13 +23,13 @@ from polar_bayes.numerics.levenberg_marquardt import MAX_UNROLLED, Derivatives, 
 from polar_bayes.observation.data import Observations
 
 Coordinates = tuple[Float[Array, ""], ...]
-"""The unconstrained vector as numbers, so that each can be differentiated by itself."""
+"""The unconstrained vector as separate numbers, which are differentiated one by one."""
 
 
 def scoring_derivatives(
     program: Program, z: Float[Array, " size"], data: Observations
 ) -> Derivatives:
-    """Value, gradient and the curvature of Fisher scoring."""
+    """Return value, gradient and the curvature of Fisher scoring."""
     # $$ H = \sum_i J_i^T \, \frac{\partial^2 (-\log p_i)}{\partial\eta^2} \, J_i + H_{prior} $$
     # where $\eta_i(z)$ are the arguments of the distribution of reading i and $J_i$ their Jacobian.
     # The curvature of $\eta$ itself, times residuals, is omitted. This is the generalized
@@ -59,12 +59,12 @@ def scoring_derivatives(
 def exact_derivatives(
     program: Program, z: Float[Array, " size"], data: Observations
 ) -> Derivatives:
-    """Value, gradient and exact second derivatives."""
+    """Return value, gradient and Hessian."""
     return derivatives(lambda z: program.potential(z, data), z)
 
 
 class _Pixel:
-    """The likelihood of a program and its data in terms of coordinates, one number each."""
+    """The likelihood of a program and its data as a function of separate coordinates."""
 
     # `arguments` is traced once, however often it is differentiated: tracing a model with NumPyro
     # is slow.
@@ -76,14 +76,14 @@ class _Pixel:
         self.arguments = jax.jit(self._arguments, inline=True)
 
     def likelihoods(self, coordinates: Coordinates) -> list[Callable]:
-        """For each observed site, the log density as a function of `arguments`."""
+        """Return, for each observed site, its log density as a function of `arguments`."""
         return [
             functools.partial(self._likelihood, *jax.tree.flatten(distribution), value)
             for distribution, value in self._observed(coordinates)
         ]
 
     def active(self, at: int, coordinates: Coordinates) -> list[int]:
-        """Which arguments of the distribution of an observed site depend on any coordinate."""
+        """Return which arguments of an observed site's distribution depend on a coordinate."""
 
         def argument(which: int, *coordinates: Array) -> Array:
             return self.arguments(coordinates)[at][which]
@@ -92,7 +92,7 @@ class _Pixel:
         return [a for a in range(count) if _depends(functools.partial(argument, a), coordinates)]
 
     def _arguments(self, coordinates: Coordinates) -> list[list[Array]]:
-        """For each observed site, the arguments of its distribution, a value for each reading."""
+        """Return, for each observed site, its distribution's arguments for every reading."""
         found = []
         for distribution, value in self._observed(coordinates):
             leaves = [x for x in jax.tree.leaves(distribution) if _is_number(x)]
@@ -125,7 +125,7 @@ def _is_number(x: Array) -> bool:
 
 
 def _jacobian[T](function: Callable[..., T], coordinates: Coordinates) -> tuple[T, T]:
-    """A tree of arrays, and its derivatives along every coordinate, (size, ...)."""
+    """Return a tree of arrays, and its derivatives along every coordinate, (size, ...)."""
     size = len(coordinates)
     if size > MAX_UNROLLED:
         units = tuple(jnp.eye(size, dtype=coordinates[0].dtype))
@@ -133,7 +133,7 @@ def _jacobian[T](function: Callable[..., T], coordinates: Coordinates) -> tuple[
         return push(units)
 
     def along(k: int) -> tuple[T, T]:
-        """The derivative along one coordinate, the others being constants."""
+        """Return the derivative along one coordinate."""
         below, x, above = coordinates[:k], coordinates[k], coordinates[k + 1 :]
         return jax.jvp(lambda x: function(*below, x, *above), (x,), (jnp.ones_like(x),))
 
@@ -142,7 +142,7 @@ def _jacobian[T](function: Callable[..., T], coordinates: Coordinates) -> tuple[
 
 
 def _depends(function: Callable, coordinates: Coordinates) -> bool:
-    """True where the result depends on the coordinates, as the program is written."""
+    """Return True if the program of the result depends on the coordinates."""
     moved: list[bool] = []
 
     @jax.custom_jvp

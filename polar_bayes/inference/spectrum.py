@@ -36,7 +36,7 @@ def predict_spectrum(
     scene: Scene | None = None,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Draws of n and a at any wavelengths.
+    """Draw n and a at any wavelengths.
 
     A Gaussian process is conditioned on each posterior draw and drawn between and beyond the
     measured wavelengths, so bands widen away from them; a law of dispersion is evaluated. The
@@ -98,7 +98,7 @@ def _checked(wavelengths: ArrayLike) -> np.ndarray:
 
 
 def _law_of(provenance: Provenance, scene: Scene | None) -> AbstractDispersion | None:
-    """The law of dispersion: of the scene that is given, or parsed from the provenance."""
+    """Return the dispersion law: of the given scene, or of the one in the provenance."""
     if scene is not None:
         return scene.dispersion
     parts = str(provenance.get("scene_parts", ""))
@@ -119,7 +119,7 @@ def _law_of(provenance: Provenance, scene: Scene | None) -> AbstractDispersion |
 
 
 def _model_of(provenance: Provenance, model: GpSpectral | None) -> GpSpectral:
-    """The model of the fit: the one that is given, or made from the settings in the provenance."""
+    """Return the model of the fit: the given one, or one from the provenance."""
     if model is not None:
         if not isinstance(model, GpSpectral):
             raise FitError(
@@ -146,7 +146,7 @@ def _model_of(provenance: Provenance, model: GpSpectral | None) -> GpSpectral:
 
 
 def _evaluate(law: AbstractDispersion, posterior: xr.Dataset, new: np.ndarray) -> xr.DataArray:
-    """A law of dispersion with the coefficients of every draw."""
+    """Evaluate a dispersion law with the coefficients of every draw."""
     draws = xr.DataArray(
         np.zeros((posterior.sizes["chain"], posterior.sizes["draw"])),
         coords={name: posterior[name] for name in ("chain", "draw")},
@@ -171,7 +171,7 @@ def _predict(
     new: np.ndarray,
     seed: list[int],
 ) -> xr.DataArray:
-    """A process at `new` wavelengths, given each draw of its weights, amplitude and length."""
+    """Draw a process at `new` wavelengths, given draws of its weights and parameters."""
     posterior = result["posterior"].dataset
     coordinates = result.children.get("unconstrained_posterior", xr.DataTree()).dataset
     needed = {name: posterior, f"{name}_level": posterior, f"{name}_weights": coordinates}

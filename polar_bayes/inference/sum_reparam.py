@@ -1,4 +1,4 @@
-r"""Two shares whose sum the readings determine before either of them.
+r"""Reparametrization of two shares by their sum, which readings determine better.
 
 Light from inside a body and leakage between the channels of a polarizer both take polarization
 away. A smooth plate tells their sum s, and hardly which of the two it is: one is large where the
@@ -34,7 +34,7 @@ from polar_bayes.priors import constraint_bounds, log_odds, log_slope, score_of_
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SumReparam:
-    """The map between coordinates along a sum and share, and those of a program.
+    """The map between a program's coordinates and those of a sum and a share.
 
     Args:
         names: The site whose range has no end, and the other one.
@@ -51,7 +51,7 @@ class SumReparam:
     def forward(
         self, x: Float[Array, " size"], data: Observations
     ) -> tuple[Float[Array, " size"], Float[Array, ""]]:
-        """Coordinates of the program, and the log volume of the map."""
+        """Return the coordinates of the program, and the log volume of the map."""
         first, second = self.positions
         odds = log_odds(x[second])
         total, least = self.moves[0](x[first]), 2.0 * jnp.finfo(x.dtype).tiny ** 0.5
@@ -69,11 +69,11 @@ class SumReparam:
 
     @functools.cached_property
     def backward_of_block(self) -> JitOnce:
-        """`backward` of many vectors, compiled."""
+        """Compiled `backward` of many vectors."""
         return JitOnce(jax.vmap(self.backward, in_axes=(0, None)))
 
     def backward(self, z: Float[Array, " size"], data: Observations) -> Float[Array, " size"]:
-        """The coordinates of a vector of the program."""
+        """Return the coordinates of a vector of the program."""
         parts = []
         for at, end, move in zip(self.positions, self.ends, self.moves, strict=True):
             value = move(z[at])
@@ -89,7 +89,7 @@ class SumReparam:
 
 
 def find_sum(program: Program) -> SumReparam | None:
-    """The map of two sites that a model declares with `infer={"summed": True}`; None without."""
+    """Return the map of two sites with `infer={"summed": True}`; None without such sites."""
     found = {}
     for name in program.summed:
         low, high = constraint_bounds(program.supports[name])

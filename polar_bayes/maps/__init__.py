@@ -1,4 +1,4 @@
-"""Many small posteriors at once: every pixel of an image is a fit of its own."""
+"""Maps: a posterior for every pixel of an image."""
 
 from polar_bayes.namespace import attach
 

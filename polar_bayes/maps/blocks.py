@@ -1,4 +1,4 @@
-"""Work in blocks, on threads or workers of a cluster, and resumable after an interruption.
+"""Work in blocks on threads or cluster workers, resumable after an interruption.
 
 A store of blocks (a map, the fits of a calibration) has a journal, which one process at a time
 locks. Its first line states the request by topic, and each further line a block, added when the
@@ -39,7 +39,7 @@ portalocker = lazy_loader.load("portalocker")  # only resumable runs need it
 # --- Threads of this process, or workers of a cluster ---------------------------------------------
 
 AHEAD = 2
-"""Blocks that wait for each that is being fitted: none idles, and memory stays small."""
+"""Queued blocks per worker: enough that no worker is idle, few enough to save memory."""
 
 
 BLOCK_THREADS = "polar_bayes blocks"
@@ -48,7 +48,7 @@ BLOCK_THREADS = "polar_bayes blocks"
 
 @contextlib.contextmanager
 def workers(scheduler: str | None) -> Iterator[tuple[Executor, int]]:
-    """Something that runs functions, and how many at a time."""
+    """Yield an executor and its number of workers: threads, or workers of a cluster."""
     if scheduler is None:
         threads = os.cpu_count() or 1
         pool = ThreadPoolExecutor(threads, BLOCK_THREADS)
@@ -76,7 +76,7 @@ def workers(scheduler: str | None) -> Iterator[tuple[Executor, int]]:
 def as_completed(
     executor: Executor, count: int, function: Callable, tasks: Iterable[tuple]
 ) -> Iterator[tuple[tuple, Any]]:
-    """Results as they come, with few tasks on their way at any time."""
+    """Yield tasks with their results as they complete, with a short queue of tasks."""
     waiting, left = {}, iter(tasks)
     try:
         while True:
@@ -100,12 +100,12 @@ ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")
 
 
 def digest(*parts: Any) -> str:
-    """SHA-256 of arrays, numbers, texts and functions, nested in any way."""
+    """Return the SHA-256 digest of nested arrays, numbers, texts and functions."""
     return hashlib.sha256(_text(parts).encode()).hexdigest()
 
 
 def request_topics(request: Request) -> dict[str, str]:
-    """One text per argument that two requests may differ in."""
+    """Return a text for each argument in which two requests may differ."""
     priors = (
         f"{name}={describe_prior(prior)} {digest(prior)}"
         for name, prior in sorted(request.priors.items())
@@ -142,7 +142,7 @@ def _text(part: Any) -> str:
 
 
 def _text_of_callable(part: Callable) -> str:
-    """The code and values of a function, or of a callable object."""
+    """Return the code and values of a function, or of a callable object, as text."""
     if isinstance(part, functools.partial):
         return _text([part.func, part.args, part.keywords])
     if isinstance(part, types.MethodType):
@@ -167,11 +167,11 @@ OTHER_OUT = "give another --out"
 REPEAT = f"repeat the command as it was, or {OTHER_OUT}"
 RESUME = f"{OTHER_OUT}, or --resume"
 VERSIONS = "versions"
-"""Topic of a request: the versions of the libraries."""
+"""Topic of a request that holds the versions of the libraries."""
 
 
 class Journal:
-    """The request of a store in the first line of a file, and a line for each finished block."""
+    """Resume journal of a store: its request in the first line, then a line per finished block."""
 
     def __init__(
         self, opened: BinaryIO, file: Path, store: Path, kind: str, topics: Mapping[str, str]
@@ -181,10 +181,10 @@ class Journal:
         self._magic = f"polar_bayes journal of a {kind} ".encode()
         self._head = self._magic + json.dumps(topics, sort_keys=True).encode() + b"\n"
         self.done: dict[str, str] = {}
-        """By the name of each finished block, the digest of what it was made from."""
+        """Digests of what the finished blocks were made from, by name of the block."""
 
     def read(self) -> None:
-        """Read which blocks are finished; a file that holds anything else is left as it is."""
+        """Read which blocks are finished; refuse a file that is not a journal."""
         content = self._opened.read()
         if self._head.startswith(content):  # empty, or cut off within the first line
             return
@@ -202,7 +202,7 @@ class Journal:
         self.done = {name: made_from for name, _, made_from in parts}
 
     def _difference(self, content: bytes) -> str:
-        """What differs between this request and the one of the file."""
+        """Describe how this request differs from that of the file."""
         begun: Any = None
         with contextlib.suppress(ValueError):
             begun = json.loads(content[len(self._magic) :].partition(b"\n")[0])
@@ -215,14 +215,14 @@ class Journal:
         )
 
     def begin(self) -> None:
-        """Cut off an incomplete last line; write the request where there is none."""
+        """Remove an incomplete last line, and write the request to an empty file."""
         self._opened.truncate(self._size)
         if self._size == 0:
             self._append(self._head)
             sync(self._file.parent)
 
     def add(self, name: str, made_from: str = "") -> None:
-        """Record a block that is on the disk."""
+        """Record a block that has been written to the disk."""
         if not self.is_in_place():
             raise taken_over(self._store)
         self._append(f"{name} {made_from}\n".encode())
@@ -235,7 +235,7 @@ class Journal:
             sync(self._file.parent)
 
     def is_in_place(self) -> bool:
-        """Whether the file is still the one that was opened."""
+        """Return whether the file is still the one that was opened."""
         try:
             return os.path.samestat(os.fstat(self._opened.fileno()), os.stat(self._file))
         except FileNotFoundError:
@@ -252,7 +252,7 @@ class Journal:
 def open_journal(
     file: Path, store: Path, kind: str, topics: Mapping[str, str], *, resume: bool
 ) -> Iterator[Journal]:
-    """The journal of a store, locked: the lock ends with the block, or with the process."""
+    """Open and lock the journal of a store for the duration of a block."""
     # A journal that was made here and in which nothing was written is removed again.
     opened, is_new = _open(file, kind, resume=resume)
     try:
@@ -271,7 +271,7 @@ def open_journal(
 
 
 def _open(file: Path, kind: str, *, resume: bool) -> tuple[BinaryIO, bool]:
-    """The file, and whether it was made here."""
+    """Return the opened file, and whether it is new."""
     try:
         with contextlib.suppress(FileExistsError):
             return file.open("x+b", buffering=0), True
@@ -298,7 +298,7 @@ def _lock(opened: BinaryIO, file: Path, store: Path) -> None:
 
 
 def taken_over(store: Path) -> OutputError:
-    """The error of a process that finds the store or its journal no longer there."""
+    """Return the error for a store or journal that another process has removed."""
     return OutputError(
         "another process has finished, moved or removed it",
         where=str(store),
@@ -308,7 +308,7 @@ def taken_over(store: Path) -> OutputError:
 
 @contextlib.contextmanager
 def written(store: Path) -> Iterator[None]:
-    """Errors of the system or the libraries below, as one line."""
+    """Convert errors of the system and of Zarr to errors of one line."""
     try:
         yield
     except PolarBayesError:

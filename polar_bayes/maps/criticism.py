@@ -1,4 +1,4 @@
-"""What the readings of each pixel say against its model: priors, noise, residuals and bounds.
+"""Model criticism in every pixel: priors, noise, residuals and bounds.
 
 These are the checks of a fit that need no more than the draws of a pixel, by whatever method, and
 its readings as predicted at its mode, where the method found one. A pixel with a problem is
@@ -41,11 +41,11 @@ from polar_bayes.priors import RANGES, support_bounds
 LOWEST, MEDIAN, HIGHEST = (LEVELS.index(level) for level in (0.025, 0.5, 0.975))
 
 PIXELS = 4096
-"""Pixels whose residuals are in memory at a time."""
+"""Number of pixels whose residuals are in memory together."""
 
 
 class Criticism(enum.IntEnum):
-    """Bits of what the checks found in a pixel."""
+    """Bit flags of the findings in a pixel."""
 
     PRIORS_CAUTION = 1
     NOISE_CAUTION = 2
@@ -62,13 +62,13 @@ PROBLEMS = Criticism.PRIORS_PROBLEM | Criticism.NOISE_PROBLEM | Criticism.RESIDU
 
 @dataclasses.dataclass(frozen=True)
 class Scalar:
-    """One number of a pixel: a parameter, and its place where that has axes of its own."""
+    """One number of a pixel: a parameter, and an index if the parameter has axes."""
 
     name: str
     index: tuple[int, ...]
 
     def of(self, values: Mapping[str, ArrayLike]) -> np.ndarray:
-        """Its values, (..., pixel) or (pixel, draw), among those of all parameters."""
+        """Return its values, (..., pixel) or (pixel, draw), from those of all parameters."""
         found = np.asarray(values[self.name])
         return found[(slice(None),) * (found.ndim - len(self.index)) + self.index]
 
@@ -106,7 +106,7 @@ def _scalars(name: str, own: tuple[int, ...]) -> list[Scalar]:
 
 
 def _end(name: str, prior: dist.Distribution) -> float:
-    """-1 or 1 where the low or the high end is where the parameter is absent or perfect, else 0."""
+    """Return -1 or 1 if a parameter's low or high end means absence or perfection, else 0."""
     low, high = support_bounds(prior)
     absent = absence(name)
     best = PERFECT.get(name, math.nan if absent is None else absent.value)
@@ -116,7 +116,7 @@ def _end(name: str, prior: dist.Distribution) -> float:
 def _bounds(
     engine: CompiledModel, priors: Mapping[str, dist.Distribution], scalars: list[Scalar]
 ) -> Iterator[Bound]:
-    """Bounds at which a parameter is not absent, and the prior has little probability."""
+    """Yield bounds with little prior probability at which the parameter is not absent."""
     for scalar in scalars:
         name = scalar.name
         ends = support_bounds(priors[name]) if name in priors else RANGES.get(name, ())
@@ -133,12 +133,12 @@ def _bounds(
 def _share_at(
     bound: float, draws: np.ndarray, weights: np.ndarray, strip: np.ndarray
 ) -> np.ndarray:
-    """Share of weighted draws, (pixel, draw), in a strip at a bound."""
+    """Return the weighted share of draws, (pixel, draw), in a strip at a bound."""
     return np.sum(weights * (np.abs(draws - bound) < strip[:, None]), axis=1)
 
 
 class PixelCriticism:
-    """The checks of the pixels of a block, filled in as answers come: marginals first."""
+    """Checks of the pixels of a block, made as answers arrive: marginals first."""
 
     def __init__(self, batch: ProblemBatch, marginals: Marginals) -> None:
         self._batch, self._marginals, engine = batch, marginals, batch.engine
@@ -150,7 +150,7 @@ class PixelCriticism:
         self._carries = np.ones((count, len(checks.judged)), bool)
 
     def describe(self, found: BatchDraws, parameters: Values) -> None:
-        """Take in the weighted draws of some pixels, and their modes where none is known."""
+        """Take in the weighted draws of some pixels, and their modes where known."""
         at, weights = found.at, found.weights
         if found.mode is not None:
             new = np.isnan(self._mode[1][at]).any(axis=(1, 2))
@@ -178,7 +178,7 @@ class PixelCriticism:
             self._at_bound[at[near]] |= share >= MASS_AT_BOUND
 
     def _find_carriers(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:
-        """Which numbers of the instrument are correlated with one of the material."""
+        """Find instrument scalars that are correlated with a material parameter."""
         material, marginals = self._checks.material, self._marginals
         for column, scalar in enumerate(self._checks.judged):
             if not material or scalar in material:
@@ -194,7 +194,7 @@ class PixelCriticism:
             self._carries[at, column] = found
 
     def judge(self, status: np.ndarray) -> np.ndarray:
-        """The `Criticism` of each pixel with a good posterior; zero of the others."""
+        """Return the `Criticism` of each pixel with a good posterior, and zero for the others."""
         good = np.flatnonzero(status == Status.GOOD)
         flags = np.zeros(status.size, np.int8)
         if good.size:
@@ -206,7 +206,7 @@ class PixelCriticism:
         return flags
 
     def _of_priors(self, good: np.ndarray) -> np.ndarray:
-        """Flags of medians in the tails of their priors."""
+        """Return flags of pixels whose medians lie in the tails of their priors."""
         scalars, ends = self._checks.judged, self._checks.ends
         if not scalars:
             return np.zeros(good.size, np.int8)
@@ -216,7 +216,7 @@ class PixelCriticism:
         return _flags(prior_conflict(below, ends), "PRIORS")
 
     def _of_noise(self, good: np.ndarray) -> np.ndarray:
-        """Flags of noise above its prior, or far above the stated errors."""
+        """Return flags of pixels with noise above its prior or the stated errors."""
         scalars, flags = self._checks.noise, np.zeros(good.size, np.int8)
         if scalars:
             tails, _ = tail_scores(self._below(scalars, good), self._checks.noise_ends)
@@ -225,18 +225,18 @@ class PixelCriticism:
         return np.where(is_large & (flags == 0), Criticism.NOISE_CAUTION, flags).astype(np.int8)
 
     def _below(self, scalars: tuple[Scalar, ...], good: np.ndarray) -> np.ndarray:
-        """Prior probabilities below the medians, (pixel, scalar)."""
+        """Return prior probabilities below the medians, (pixel, scalar)."""
         priors, quantiles = self._checks.priors, self._marginals.quantiles
         medians = ((s.name, s.of(quantiles)[MEDIAN, good]) for s in scalars)
         return np.stack([probability_below(priors[name], x) for name, x in medians], axis=1)
 
     def _quantile(self, name: str, which: int) -> np.ndarray:
-        """One quantile of a parameter of the noise; one where the model has no such parameter."""
+        """Return a quantile of a noise parameter; one if the model lacks that parameter."""
         known = self._marginals.quantiles
         return known[name][which] if name in known else np.ones(self._at_bound.size)
 
     def _residual_tails(self, good: np.ndarray) -> np.ndarray:
-        """p-values of the residuals of these pixels at their modes; NaN where there is none."""
+        """Return p-values of residuals of pixels at their modes; NaN if not computed."""
         tails = np.full(good.size, np.nan)
         known = np.flatnonzero(np.isfinite(self._mode[1][good]).all(axis=(1, 2)))
         factor = self._quantile(NOISE_FACTOR, MEDIAN)
@@ -270,7 +270,7 @@ class PixelCriticism:
 
 
 def _flags(p_value: np.ndarray, check: str) -> np.ndarray:
-    """The flag of each p-value; none where it is NaN."""
+    """Return the flag of each p-value; zero for NaN."""
     caution, problem = Criticism[f"{check}_CAUTION"], Criticism[f"{check}_PROBLEM"]
     found = np.where(p_value < PROBLEM, problem, np.where(p_value < CAUTION, caution, 0))
     return found.astype(np.int8)

@@ -1,4 +1,4 @@
-"""Maps of an image: every pixel fitted by itself."""
+"""Maps of an image: fits of every pixel."""
 
 import dataclasses
 import enum
@@ -43,7 +43,7 @@ from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 from polar_bayes.progress import Counter, no_progress, with_counter
 
 BLOCK = 4096
-"""Pixels of a block: enough to fill many batches, few enough for many blocks in memory."""
+"""Pixels of a block: enough for full batches, few enough to hold many blocks in memory."""
 
 
 DIAGNOSTICS = {
@@ -56,10 +56,10 @@ DIAGNOSTICS = {
 }
 
 FILL_VALUES = {"status": int(Status.NOT_FITTED), "criticism": UNKNOWN}
-"""Of chunks in a Zarr store that are not written."""
+"""Values of chunks in a Zarr store that are not written, by variable."""
 
 NUMBER = "pixel_number"
-"""Variable of a block: index of each pixel in the whole image, row by row."""
+"""Variable of a block that holds the index of each pixel in the image, row by row."""
 
 
 @with_counter("pixels")
@@ -77,7 +77,7 @@ def fit_pixels(
     shared: str | Sequence[str] | None = None,
     progress: Counter | None = None,
 ) -> xr.Dataset:
-    """Fit every pixel of an image by itself.
+    """Fit every pixel of an image separately.
 
     Each pixel is the fit that `polar_bayes.fit` makes of it, by the Laplace approximation at its
     mode, corrected, unless `method` says otherwise: the same model, priors and links. Parameters in
@@ -134,7 +134,7 @@ def fit_pixels(
 
 @dataclasses.dataclass(frozen=True)
 class MapPlan:
-    """A checked request of a map, which can be sent to another process."""
+    """A validated request of a map, which can be sent to another process."""
 
     key: str  # that of the compiled programs; plans with the same key are equal
     request: Request = dataclasses.field(compare=False)
@@ -146,21 +146,21 @@ class MapPlan:
     found: Mapping[str, object] = dataclasses.field(default_factory=dict, compare=False)
 
     def sharing(self, names: Sequence[str]) -> "MapPlan":
-        """The same request, where pixels share these parameters."""
+        """Return the request with these parameters shared by all pixels."""
         own, no_unit = sorted(self.own_directions), self.intensity_unit is None
         key = layout_key(self.request, own, no_unit, tuple(names))
         shared = tuple(of_priors(names, self.request.priors))
         return dataclasses.replace(self, key=key, shared=shared)
 
     def observe(self, capture: xr.Dataset) -> Observations:
-        """A block, or one pixel, as arrays."""
+        """Return a block, or one pixel, as arrays."""
         limit, unit = self.request.largest_view_zenith, self.intensity_unit
         data = observe(capture, largest_view_zenith=limit, intensity_unit=unit)
         priors = jax.tree.map(jnp.asarray, as_priors(self.shared))
         return dataclasses.replace(data, shared=priors)
 
     def marginals(self, count: int) -> Marginals:
-        """Those of so many pixels, to be filled in."""
+        """Return empty marginals of a number of pixels."""
         priors = self.request.priors
         scores = [functools.partial(each.scores, priors[each.name]) for each in self.shared]
         return Marginals(count, self.sizes, scores=scores)
@@ -174,7 +174,7 @@ class MapPlan:
 
     @property
     def engine(self) -> CompiledModel:
-        """The compiled programs, made at first use in each process."""
+        """The compiled model, made at first use in each process."""
 
         def pixel() -> Observations:
             with jax.enable_x64(True):
@@ -184,14 +184,14 @@ class MapPlan:
 
     @property
     def axes(self) -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
-        """Names and lengths of the axes, within a pixel, of every parameter that has a map."""
+        """Names and lengths of the axes of each mapped parameter within a pixel."""
         shared = {each.name for each in self.shared}
         found = self.engine.parameter_axes
         return {name: axes for name, axes in found.items() if name not in shared}
 
     @property
     def sizes(self) -> dict[str, tuple[int, ...]]:
-        """Lengths of the same axes."""
+        """Lengths of the axes of each mapped parameter within a pixel."""
         return {name: own for name, (_, own) in self.axes.items()}
 
 
@@ -230,7 +230,7 @@ def plan_map(
 
 
 def estimate_plan(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
-    """The plan with what some pixels tell of all: what these share, and the starts they call for.
+    """Complete the plan from a sample of pixels: shared parameters, and number of starts.
 
     It takes as long as hundreds of fits, and must be done once for one image.
     """
@@ -238,7 +238,7 @@ def estimate_plan(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
 
 
 def _check_shared(names: Sequence[str], request: Request) -> None:
-    """Refuse what is no number of the model's, or is part of the material."""
+    """Refuse shared parameters that are vectors, unknown, or part of the material."""
     for name in names:
         known = [each for each in request.priors if each not in MATERIAL_PARAMETERS]
         if name not in known or request.priors[name].event_shape:
@@ -247,7 +247,7 @@ def _check_shared(names: Sequence[str], request: Request) -> None:
 
 
 def _with_shared(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
-    """The plan with the posterior of what pixels share, from some of them drawn at random."""
+    """Add the posterior of shared parameters, estimated from pixels drawn at random."""
     request, settings = plan.request, plan.settings
     batch = plan.batch(_random_pixels(capture, request.seed, SHARED_PIXELS))
     method = settings if isinstance(settings, CorrectedLaplace) else CorrectedLaplace()
@@ -264,13 +264,13 @@ def _with_shared(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
 
 
 def _sharing_nothing(plan: MapPlan, reason: str) -> MapPlan:
-    """The plan in which each pixel has parameters of its own, and why."""
+    """Return the plan without shared parameters, with the reason."""
     told = {"names": [each.name for each in plan.shared], "reason": reason}
     return dataclasses.replace(plan.sharing(()), found={"not_shared": told})
 
 
 def _with_settings(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
-    """The plan with the settings that the image calls for."""
+    """Return the plan with method settings that suit the image."""
 
     def sample(count: int) -> ProblemBatch:
         return plan.batch(_random_pixels(capture, plan.request.seed, count))
@@ -281,7 +281,7 @@ def _with_settings(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
 
 
 def _random_pixels(capture: xr.Dataset, seed: int, count: int) -> xr.Dataset:
-    """As many pixels with enough views as are wanted, or all there are, as an image of one row."""
+    """Draw pixels that have enough views, as an image of one row."""
     rows, columns = (capture.sizes[dim] for dim in IMAGE)
     order = np.random.default_rng(seed).permutation(rows * columns)
     found: list[xr.Dataset] = []
@@ -300,7 +300,7 @@ def _random_pixels(capture: xr.Dataset, seed: int, count: int) -> xr.Dataset:
 
 
 def _fullest_pixel(capture: xr.Dataset) -> xr.Dataset:
-    """The first pixel that has as many valid views as any in its rows; read row by row."""
+    """Return the first pixel with the most valid views of the image; rows are read one by one."""
     best, most = None, 0
     for y in range(capture.sizes["y"]):
         row = mask_missing(capture.isel(y=y).load())
@@ -318,13 +318,13 @@ def _fullest_pixel(capture: xr.Dataset) -> xr.Dataset:
 
 
 def _count_views(readings: xr.Dataset) -> xr.DataArray:
-    """Views of each pixel in which any reading is valid."""
+    """Count the views of each pixel with any valid reading."""
     valid = readings["valid"]
     return valid.any([d for d in valid.dims if d not in (*IMAGE, "view")]).sum("view")
 
 
 def _intensity_unit(capture: xr.Dataset) -> float | None:
-    """The largest intensity of the whole image, where it states no saturation level."""
+    """Return the largest intensity of the image; None if a saturation level is stated."""
     if "intensity" not in capture or "saturation_level" in capture["intensity"].attrs:
         return None
     readings = mask_missing(capture)
@@ -333,7 +333,7 @@ def _intensity_unit(capture: xr.Dataset) -> float | None:
 
 
 def provenance_json(plan: MapPlan) -> str:
-    """Provenance of maps, as JSON."""
+    """Return the provenance of maps as JSON."""
     request = plan.request
     provenance = {
         **request.describe(),
@@ -352,7 +352,7 @@ def provenance_json(plan: MapPlan) -> str:
 
 
 def _described(parameter: SharedParameter, request: Request) -> dict[str, object]:
-    """A shared parameter in what JSON can hold."""
+    """Describe a shared parameter in types of JSON."""
     with jax.enable_x64(True):
         quantiles = parameter.quantiles(request.priors[parameter.name], LEVELS)
     return {
@@ -366,7 +366,7 @@ def _described(parameter: SharedParameter, request: Request) -> dict[str, object
 
 
 def with_pixel_numbers(image: xr.Dataset, region: Mapping[str, slice] | None = None) -> xr.Dataset:
-    """A block, by default the whole image, with the index of each pixel, row by row."""
+    """Add the index of each pixel, row by row, to a block or image."""
     region = region or {dim: slice(None) for dim in IMAGE}
     block = image.isel(region)
     y, x = (xr.Variable((dim,), np.arange(image.sizes[dim])[region[dim]]) for dim in IMAGE)
@@ -376,7 +376,7 @@ def with_pixel_numbers(image: xr.Dataset, region: Mapping[str, slice] | None = N
 
 
 def blank(capture: xr.Dataset, plan: MapPlan) -> xr.Dataset:
-    """Maps of the image without values: names, axes, types and attributes; lazy (Dask)."""
+    """Return lazy maps without values: names, axes, types and attributes (Dask)."""
     corner = capture.isel({dim: slice(1) for dim in IMAGE})
     nothing, unknown = Outcome(1, Status.NOT_FITTED), np.full(1, UNKNOWN, np.int8)
     tiny = maps_of(plan.marginals(1), nothing, unknown, corner, plan)
@@ -397,7 +397,7 @@ def blank(capture: xr.Dataset, plan: MapPlan) -> xr.Dataset:
 
 
 def _in_memory(capture: xr.Dataset, plan: MapPlan, progress: Counter) -> xr.Dataset:
-    """Blocks on threads, put together in memory."""
+    """Fit blocks on threads, and combine the maps in memory."""
     maps = blank(capture, plan).compute().copy(deep=True)  # repeated values are read-only
     every, done = capture.sizes["y"] * capture.sizes["x"], 0
     with workers(None) as (pool, count):
@@ -440,7 +440,7 @@ def fit_block(block: xr.Dataset, plan: MapPlan) -> xr.Dataset:
 
 
 def mask_missing(capture: xr.Dataset) -> xr.Dataset:
-    """A capture whose missing readings are marked as such."""
+    """Mark missing readings of a capture as not valid."""
     valid = capture.get("valid", xr.DataArray(True)).astype(bool)
     for name in READINGS:
         if name in capture:
@@ -451,7 +451,7 @@ def mask_missing(capture: xr.Dataset) -> xr.Dataset:
 def maps_of(
     found: Marginals, outcome: Outcome, criticism: np.ndarray, block: xr.Dataset, plan: MapPlan
 ) -> xr.Dataset:
-    """The marginals of a block, and how they are judged, as labeled maps."""
+    """Return the marginals and flags of a block as labeled maps."""
     shape = tuple(block.sizes[dim] for dim in IMAGE)
     variables: dict[str, tuple] = {}
     for name, (own, sizes) in plan.axes.items():

@@ -1,4 +1,4 @@
-"""Images and maps in files, opened lazily; a damaged part of one is an error of one line."""
+"""Lazily opened images and maps; a damaged part of a file gives an error of one line."""
 
 import os
 from pathlib import Path
@@ -24,25 +24,25 @@ from polar_bayes.paths import as_path
 zarr = lazy_loader.load("zarr")  # 0.1 s that results of other kinds need not wait for
 
 DISAGREEMENT = 3.1
-"""Of the information matrix test, a standard normal number: once in a thousand right models."""
+"""Information matrix test (standard normal) that one in a thousand correct models exceeds."""
 
 UNKNOWN = -1
-"""Value of chunks that are not written: no check has a caution and a problem."""
+"""Value in chunks that are not written: no check gives both a caution and a problem."""
 
 MOST_BYTES = 2**31
-"""Maps in chunks (Dask) that are computed at once, into memory."""
+"""Largest size of maps in chunks (Dask) that are loaded into memory."""
 
 REQUEST = "request_sha256"
-"""Root attribute of a map from its beginning: the fingerprint of its request."""
+"""Root attribute with the fingerprint of the request, present from the beginning."""
 
 FINISHED = "capture_sha256"
-"""Root attribute that is written last: a map that holds it is finished. Digest of the readings."""
+"""Root attribute with the digest of the readings, written last: only finished maps have it."""
 
 COPY = "copy the store again, or make the map again"
 
 
 def open_capture(path: str | os.PathLike[str]) -> xr.Dataset:
-    """A capture from a file, its values read when they are needed where it is a Zarr store.
+    """Open a capture; values in a Zarr store are read when they are needed.
 
     Args:
         path: A netCDF file, or the folder of a Zarr store (its name ends in .zarr).
@@ -68,7 +68,7 @@ def open_capture(path: str | os.PathLike[str]) -> xr.Dataset:
 
 
 def check_whole(path: Path) -> None:
-    """Refuse a store with missing chunks, which would read as missing readings."""
+    """Refuse a store with missing chunks, which would be read as missing readings."""
     for name in READINGS:
         if path.suffix != ".zarr" or not (path / name).is_dir():
             continue
@@ -80,7 +80,7 @@ def check_whole(path: Path) -> None:
 
 
 def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
-    """The maps of a Zarr store, their values read when they are needed.
+    """Open the maps of a Zarr store, whose values are read when they are needed.
 
     Args:
         path: What `polar_bayes.maps.map_file` or `polar-bayes map` wrote.
@@ -108,7 +108,7 @@ def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
 
 
 def _check_maps(maps: xr.Dataset, store: Path) -> None:
-    """Refuse metadata that no map has."""
+    """Refuse metadata that do not describe maps."""
     try:
         provenance_of(maps)
     except FitError as error:
@@ -135,7 +135,7 @@ def _check_maps(maps: xr.Dataset, store: Path) -> None:
 
 
 def _has_meanings(flags: xr.Variable) -> bool:
-    """Whether every value of a flag has a meaning."""
+    """Return whether every value of a flag has a meaning."""
     meanings = str(flags.attrs.get("flag_meanings", "")).split()
     numbered = flags.attrs.get("flag_values", list(range(len(meanings))))
     values = flags.attrs.get("flag_masks", numbered)
@@ -145,7 +145,7 @@ def _has_meanings(flags: xr.Variable) -> bool:
 
 
 def _missing(array: Path, error: type[PolarBayesError]) -> tuple[int, int]:
-    """Chunks of an array that are not there, and all."""
+    """Count the missing chunks of an array, and all its chunks."""
     try:
         opened = zarr.open_array(array, mode="r")
         return opened.nchunks - opened.nchunks_initialized, opened.nchunks
@@ -156,7 +156,7 @@ def _missing(array: Path, error: type[PolarBayesError]) -> tuple[int, int]:
 
 
 def _open_store(path: Path, error: type[PolarBayesError], hint: str, **options: Any) -> xr.Dataset:
-    """A Zarr store, lazily; reading a broken chunk of a variable is an error with its place."""
+    """Open a Zarr store lazily; errors name the broken chunk of a variable."""
     where = str(path)
     try:
         opened = xr.open_dataset(path, engine="zarr", consolidated=False, cache=False, **options)
@@ -170,7 +170,7 @@ def _open_store(path: Path, error: type[PolarBayesError], hint: str, **options: 
 
 
 class _Guarded(BackendArray):
-    """A variable of a store; a chunk that cannot be read is an error with its place."""
+    """A variable of a store; errors name the chunk that cannot be read."""
 
     def __init__(
         self, variable: xr.Variable, where: str, error: type[PolarBayesError], hint: str
@@ -196,14 +196,14 @@ class _Guarded(BackendArray):
 
 
 def _range(part: slice | np.ndarray | int, length: int) -> str:
-    """The range of an axis that was requested."""
+    """Format the requested range of an axis."""
     if isinstance(part, slice):
         return "{}:{}".format(*part.indices(length))
     return str(part) if np.ndim(part) == 0 else f"{np.min(part)}:{np.max(part) + 1}"
 
 
 def ensure_loaded(maps: xr.Dataset) -> xr.Dataset:
-    """Maps whose values can be read repeatedly."""
+    """Load maps in chunks (Dask), which would otherwise be fitted again at each access."""
     # Maps in chunks (Dask) would be fitted again at each access, so they are computed once.
     if not any(variable.chunks for variable in maps.variables.values()):
         return maps
@@ -220,11 +220,11 @@ CHUNK = 65536
 """Pixels of a chunk of a store, which are read together."""
 
 ANSWERED = (Status.GOOD, Status.CONTRADICTED)
-"""Statuses of pixels whose numbers are those of their model."""
+"""Statuses of pixels that have numbers from their model."""
 
 
 def count_pixels(maps: xr.Dataset) -> dict[str, int]:
-    """The number of pixels of each status.
+    """Count the pixels of each status.
 
     Args:
         maps: Of `fit_pixels`, or opened from a store.
@@ -250,7 +250,7 @@ def count_pixels(maps: xr.Dataset) -> dict[str, int]:
 
 
 def count_criticism(maps: xr.Dataset) -> pd.DataFrame:
-    """The number of pixels in which each check found that the readings speak against the model.
+    """Count the pixels in which each check found a contradiction to the model.
 
     Args:
         maps: Of `fit_pixels`, or opened from a store.
@@ -284,7 +284,7 @@ def count_criticism(maps: xr.Dataset) -> pd.DataFrame:
 
 
 def criticism_sentences(maps: xr.Dataset) -> list[str]:
-    """How many pixels their readings contradict or give a caution, and by which checks."""
+    """State how many pixels contradict the model or give a caution, by check."""
     table, sentences = count_criticism(maps), []
     for level, one, several in (
         ("problem", "pixel is contradicted by its", "pixels are contradicted by their"),
@@ -304,7 +304,7 @@ def criticism_sentences(maps: xr.Dataset) -> list[str]:
 
 
 def shared_parameters(maps: xr.Dataset) -> pd.DataFrame:
-    """The posterior of what all pixels of a map share.
+    """Return the posterior of the parameters that all pixels share.
 
     Args:
         maps: Of `fit_pixels`, or opened from a store.
@@ -327,7 +327,7 @@ def shared_parameters(maps: xr.Dataset) -> pd.DataFrame:
 
 
 def start_sentences(maps: xr.Dataset) -> list[str]:
-    """From how many starts each pixel was searched, and what a sample of pixels said about that."""
+    """State the number of starts per pixel, and how a sample determined it."""
     provenance = provenance_of(maps)
     compared, settings = provenance.get("starts_compared"), provenance.get("settings") or {}
     if not compared:
@@ -342,7 +342,7 @@ def start_sentences(maps: xr.Dataset) -> list[str]:
 
 
 def shared_cautions(maps: xr.Dataset) -> list[str]:
-    """A sentence for each parameter of which the pixels share no one value, though they should."""
+    """Caution against shared parameters on which the pixels disagree."""
     found, own = shared_parameters(maps), provenance_of(maps).get("not_shared")
     cautions = []
     if own:
@@ -360,12 +360,12 @@ def shared_cautions(maps: xr.Dataset) -> list[str]:
 
 
 def map_parameters(maps: xr.Dataset) -> list[str]:
-    """Names of the parameters that have a map."""
+    """Return names of the parameters that have a map."""
     return [str(name) for name in maps.data_vars if f"{name}_quantile" in maps]
 
 
 def checked_status(maps: xr.Dataset) -> xr.DataArray:
-    """Statuses of maps, in memory; a pixel that has an answer without numbers is not fitted."""
+    """Return statuses in memory; pixels with an answer but no numbers count as not fitted."""
     # A chunk that was lost from a store reads as not a number, or as a flag that is not known.
     answers = _answers(maps)
     here = maps[["status", *answers, *(["criticism"] if "criticism" in maps else [])]].load()
@@ -380,7 +380,7 @@ def checked_status(maps: xr.Dataset) -> xr.DataArray:
 
 
 def _answers(maps: xr.Dataset) -> list[str]:
-    """Names of the maps that are finite where a pixel has an answer."""
+    """Return names of the maps that are finite where a pixel has an answer."""
     return [
         f"{name}{ending}"
         for name in map_parameters(maps)

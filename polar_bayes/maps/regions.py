@@ -1,4 +1,4 @@
-r"""Means of regions of a map, and their contrasts, with what all pixels share counted once.
+r"""Means of regions of a map, and their contrasts, including errors that pixels share.
 
 Given the shared parameters, pixels are independent. With $u_k$ the standard score of shared
 parameter k and $b_{ik} = dE[x_i]/du_k$, the mean of a region of N pixels has the variance
@@ -25,7 +25,7 @@ from polar_bayes.maps.lazy import CHUNK, checked_status, map_parameters
 
 
 class _Sums(NamedTuple):
-    """Of one parameter over the pixels of every region: each (region, ...)."""
+    """Sums of one parameter over the pixels of every region, each (region, ...)."""
 
     mean: np.ndarray
     own_variance: np.ndarray
@@ -35,19 +35,19 @@ class _Sums(NamedTuple):
 
     @property
     def sd(self) -> np.ndarray:
-        """Of the mean, with what is shared counted once: (region, ...)."""
+        """Standard deviation of the mean, with shared errors counted once, (region, ...)."""
         return np.sqrt(self.own_variance + np.sum(self.slope**2, axis=0))
 
     @property
     def is_pull_known(self) -> np.ndarray:
-        """Where pixels say more than their priors: (region, ...)."""
+        """True where pixels are more informative than their priors, (region, ...)."""
         return ~(np.sqrt(self.pull_variance) > self.sd)
 
 
 def region_means(
     maps: xr.Dataset, labels: xr.DataArray | np.ndarray, *, against: object = None
 ) -> xr.Dataset:
-    """The mean of each parameter over every region of a map, or how regions differ.
+    """Return the mean of each parameter over every region of a map, or contrasts of regions.
 
     The answer is that of the map's own model: pixels have priors of their own and are independent
     given what they share, which is counted once. Where pixels are alike, their priors all pull the
@@ -118,7 +118,7 @@ def region_means(
 
 
 def region_table(found: xr.Dataset) -> pd.DataFrame:
-    """What `region_means` found as a table.
+    """Return the results of `region_means` as a table.
 
     Args:
         found: Of `region_means`.
@@ -148,7 +148,7 @@ def region_table(found: xr.Dataset) -> pd.DataFrame:
 
 
 def load_labels(path: str | os.PathLike[str]) -> np.ndarray:
-    """The labels of regions from an image file, as a program for drawing masks writes it.
+    """Read labels of regions from an image file.
 
     Args:
         path: An image with one channel of gray values, PNG or TIFF, or an array in a .npy file.
@@ -168,7 +168,7 @@ def load_labels(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def _numbered(maps: xr.Dataset, labels: xr.DataArray | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Number of each pixel's region, -1 for none, (y, x); and the labels of regions."""
+    """Return the number of each pixel's region, -1 for none, (y, x), and the labels."""
     if isinstance(labels, xr.DataArray) and set(labels.dims) == set(IMAGE):
         labels = labels.transpose(*IMAGE).to_numpy()
     values, shape = np.asarray(labels), tuple(maps.sizes[dim] for dim in IMAGE)
@@ -186,7 +186,7 @@ def _numbered(maps: xr.Dataset, labels: xr.DataArray | np.ndarray) -> tuple[np.n
 
 
 def _position(labels: np.ndarray, against: object) -> int:
-    """Which of the regions has this label."""
+    """Return the index of the region with this label."""
     where = np.flatnonzero(labels == against)
     if not where.size:
         hint = f"give one of {', '.join(map(str, labels[:10]))}"
@@ -197,7 +197,7 @@ def _position(labels: np.ndarray, against: object) -> int:
 def _sums_of(
     block: xr.Dataset, name: str, use: np.ndarray, region: np.ndarray, count: int
 ) -> _Sums:
-    """What the pixels `use` of a block add to the sums of their regions."""
+    """Return the contributions of the pixels `use` of a block to the sums of regions."""
     own = _own_dims(block, name)
 
     def values(name: str) -> np.ndarray:
@@ -229,12 +229,12 @@ def _sums_of(
 
 
 def _own_dims(maps: xr.Dataset, name: str) -> list[str]:
-    """Axes of a parameter within a pixel."""
+    """Return the axes of a parameter within a pixel."""
     return [str(dim) for dim in maps[name].dims if dim not in IMAGE]
 
 
 def _of_regions(sums: _Sums, count: np.ndarray, reference: int | None) -> _Sums:
-    """The same of means rather than sums, less those of the region of reference."""
+    """Return means instead of sums, minus those of the region of reference."""
     size = count.reshape(-1, *[1] * (sums.mean.ndim - 1)).astype(float)
     with np.errstate(divide="ignore", invalid="ignore"):  # regions without an answer are NaN
         mean, slope, pull = (x / size for x in (sums.mean, sums.slope, sums.pull))
@@ -247,7 +247,7 @@ def _of_regions(sums: _Sums, count: np.ndarray, reference: int | None) -> _Sums:
 
 
 def _cautions(name: str, labels: np.ndarray, found: _Sums, shown: np.ndarray) -> Iterator[str]:
-    """Where an interval would not hold if all pixels of a region were alike."""
+    """Caution against regions whose intervals would be wrong if their pixels were alike."""
     pull, chance, sd = np.abs(found.pull), np.sqrt(found.pull_variance), found.sd
     # Where pixels are alike, a 95% interval that is moved by half an sd holds in 92%.
     is_moved = (pull > 0.5 * sd) & (pull > 3.0 * chance)

@@ -1,4 +1,4 @@
-r"""Residuals of the readings of many pixels at their modes, and what noise after a fit does not do.
+r"""Residuals of the readings of many pixels at their modes, tested against noise after a fit.
 
 Residuals are normal scores of the readings under the noise at the mode, $\Phi^{-1}(F_i(y_i))$. What
 the parameters can change is taken out of them once more, as least squares would: at a bound, or
@@ -39,16 +39,16 @@ from polar_bayes.observation.distributions import MeanConcentrationBeta, SensorS
 from polar_bayes.physics.geometry import Geometry, unit_vectors
 
 LEAST_READINGS, LEAST_FREEDOM = 6, 1.5
-"""Readings, and what a fit leaves of their number, below which residuals are not judged."""
+"""Fewest readings, and fewest residual degrees of freedom, with which residuals are tested."""
 
 HALVINGS, SMALLEST = 40, 1e-12
-"""Of the interval in which a saddlepoint is searched; smallest divisor there."""
+"""Bisections in the search for a saddlepoint; smallest divisor there."""
 
 # --- Normal scores of readings --------------------------------------------------------------------
 
 
 class Distance(NamedTuple):
-    """A reading's distance from its prediction under Student's t, in scales; between two limits."""
+    """Distance of a reading from its prediction in scales of Student's t, and both limits."""
 
     distance: AnyArray
     freedom: AnyArray
@@ -56,7 +56,7 @@ class Distance(NamedTuple):
     high: AnyArray
 
     def scores(self) -> np.ndarray:
-        """Normal scores; NaN where the distance is."""
+        """Return normal scores; NaN where the distance is NaN."""
         distance, freedom, *ends = (np.asarray(x, float) for x in self)
         if np.isinf(freedom).all():  # normal noise, which has no limits
             return distance
@@ -75,19 +75,19 @@ class Share(NamedTuple):
     second: AnyArray
 
     def scores(self) -> np.ndarray:
-        """Normal scores."""
+        """Return normal scores."""
         x, a, b = (np.asarray(each, float) for each in self)
         return _scores(special.betainc(a, b, x), special.betaincc(a, b, x))
 
 
 def _scores(below: np.ndarray, above: np.ndarray) -> np.ndarray:
-    """Normal scores of probabilities below and above; each is exact where it is small."""
+    """Return normal scores of lower and upper tails, each exact where it is small."""
     low, high = (special.ndtri(each / (below + above)) for each in (below, above))
     return np.where(below < above, low, -high)
 
 
 class Reading(NamedTuple):
-    """A reading by the distribution of its noise, and its prediction in units of that noise."""
+    """A reading relative to its noise, and its prediction in units of that noise."""
 
     standard: Distance | Share
     center: Array
@@ -155,7 +155,7 @@ def _by_distance(
 
 
 def fitted_readings(engine: CompiledModel, names: tuple[str, ...]) -> JitOnce:
-    """The program of the readings of one pixel at its mode, and of what changes them."""
+    """Make the program of readings at the mode of a pixel, and of their derivatives."""
     program = engine.single_program
 
     def of_pixel(
@@ -189,7 +189,7 @@ def residual_tail(
     kernels: Sequence[np.ndarray],
     factor: Float[np.ndarray, " pixel"],
 ) -> Float[np.ndarray, " pixel"]:
-    """p-value of residuals as noise after a fit: of neighbors, the largest, and all of them.
+    """Return the joint p-value of neighboring residuals, the largest, and all of them.
 
     `factor` is the true over the stated error of each pixel: where readings scatter less than
     stated, one that keeps to its statement is no outlier. NaN where there are too few readings.
@@ -220,7 +220,7 @@ def residual_tail(
 
 
 def _basis(changes: np.ndarray) -> np.ndarray:
-    """An orthonormal basis of what the readings say about the parameters, zero where nothing."""
+    """Return an orthonormal basis of the space of fitted readings, padded with zeros."""
     flat = changes.reshape(len(changes), -1, changes.shape[-1])
     shares, axes = np.linalg.eigh(np.swapaxes(flat, 1, 2) @ flat)
     # Directions of which the readings say a tenth of what is known after the fit.
@@ -229,7 +229,7 @@ def _basis(changes: np.ndarray) -> np.ndarray:
 
 
 def direction_kernels(geometry: Geometry) -> list[Float[np.ndarray, "view view"]]:
-    """How near the directions of two views are, for each scale; none where all are far apart."""
+    """Return kernels of the distance between directions, for scales that connect views."""
     first = [np.asarray(x, float).reshape(-1, np.shape(x)[-1])[0] for x in geometry[:4]]
     both = unit_vectors(np.stack(first, axis=-1).reshape(-1, 2, 2))  # of the viewer and the light
     apart = np.sum((both[:, None] - both) ** 2, axis=(-2, -1))
@@ -241,7 +241,7 @@ def direction_kernels(geometry: Geometry) -> list[Float[np.ndarray, "view view"]
 def _neighbor_tail(
     e: np.ndarray, known: np.ndarray, basis: np.ndarray, freedom: np.ndarray, kernel: np.ndarray
 ) -> np.ndarray:
-    """Probability that Moran's I is as large; one where it is not far above its mean."""
+    """Return the tail probability of Moran's I; one if it is not far above its mean."""
     squares = np.maximum(np.sum(e**2, axis=(1, 2)), SMALLEST)
     index = np.sum((e @ kernel) * e, axis=(1, 2)) / squares
     # Of M K and its square the traces, which give the mean and the variance.
@@ -263,7 +263,7 @@ def _neighbor_tail(
 def _forms(
     known: np.ndarray, basis: np.ndarray, kernel: np.ndarray, index: np.ndarray
 ) -> Float[np.ndarray, "pixel reading reading"]:
-    """The matrix of each pixel whose quadratic form is above zero where Moran's I is larger."""
+    """Return matrices whose quadratic forms are positive where Moran's I is larger."""
     pixels, groups, views = known.shape
     unit, flat = np.eye(groups * views), known.reshape(pixels, -1)
     basis = basis.reshape(pixels, groups * views, -1)
@@ -274,7 +274,7 @@ def _forms(
 
 
 def _positive_share(weights: Float[np.ndarray, "pixel term"]) -> np.ndarray:
-    """Probability that a sum of squared normal numbers, with a negative mean, is above zero."""
+    """Return the probability that a weighted sum of chi-squared numbers is positive."""
     # The saddlepoint s, where the slope of K(s) = -1/2 sum log(1 - 2 s w) vanishes, is above 0.
     low, high = np.zeros(len(weights)), 0.5 / np.maximum(weights.max(axis=1), SMALLEST)
     for _ in range(HALVINGS):

@@ -1,4 +1,4 @@
-r"""Parameters that all pixels of an image share, such as the gain of the polarizer or the noise.
+r"""Parameters that all pixels of an image share, such as a polarizer's gain or the noise.
 
 Their posterior given many pixels is
 
@@ -48,20 +48,20 @@ from polar_bayes.numerics.psis import draws_at
 from polar_bayes.observation.data import Observations
 
 PIXELS = 512
-"""Pixels from which shared parameters are estimated. Errors of weighted means add up over pixels,
-so that many more would call for more draws of each."""
+"""Number of pixels from which shared parameters are estimated. Errors of weighted means add up over
+pixels, so more pixels would need more draws of each."""
 
 DRAWS = 256
-"""Resampled draws of each pixel at which derivatives are taken. With 64, Monte Carlo errors are a
-large part of the information of 256 pixels whose readings say little that priors do not."""
+"""Resampled draws of each pixel at which derivatives are computed. With 64, Monte Carlo errors are
+a large part of the information of 256 pixels with weakly informative readings."""
 
 LONGEST_STEP, SHRINKAGE, GROWTH, MOST_STEPS = 4.0, 30.0, 2.0, 20
-"""Of Newton's method: the longest step in sds of the priors of pixels, how fast these narrow and
-widen, and the number of steps."""
+"""Settings of Newton's method: longest step in sds of the pixels' priors, largest factors by which
+these priors narrow and widen in one step, and number of steps."""
 
 SETTLED, WIDE, NARROW = 0.25, 50.0, 2.0
-"""The last step in posterior sds; variances of the priors of pixels over those of the posterior,
-above which derivatives at one place say too little, and below which the search may end."""
+"""Largest last step in posterior sds; ratio of prior to posterior variance above which derivatives
+at one place are insufficient, and ratio below which the search may end."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,12 +84,12 @@ class SharedParameter:
     disagreement: float = 0.0
 
     def quantiles(self, prior: dist.Distribution, levels: Sequence[float]) -> np.ndarray:
-        """Quantiles of the parameter itself."""
+        """Return quantiles of the parameter."""
         scores = self.mean + self.sd * scipy.special.ndtri(np.asarray(levels))
         return np.asarray(_values(dist.biject_to(prior.support), scores), float)
 
     def scores(self, prior: dist.Distribution, draws: Values) -> np.ndarray:
-        """Standard scores of draws, in the shape of these."""
+        """Return standard scores of draws, in the shape of the draws."""
         # Some pixels have as many draws as they need, and JAX compiles for each length: those of
         # 2**14 are computed together.
         with jax.enable_x64(True):
@@ -103,25 +103,25 @@ class SharedParameter:
 
 @jax.jit
 def _values(transform: transforms.Transform, x: Array) -> Array:
-    """Values of unconstrained coordinates."""
+    """Return values at unconstrained coordinates."""
     return transform(x)
 
 
 @jax.jit
 def _coordinates_of(transform: transforms.Transform, values: Array) -> Array:
-    """Unconstrained coordinates of values."""
+    """Return unconstrained coordinates of values."""
     return transform.inv(values)
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _drawn(prior: dist.Distribution) -> Array:
-    """Unconstrained coordinates of draws from a prior."""
+    """Return unconstrained coordinates of draws from a prior."""
     return dist.biject_to(prior.support).inv(prior.sample(jax.random.key(0), (4000,)))
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _log_density_derivatives(prior: dist.Distribution, x: Array) -> tuple[Array, Array]:
-    """First and second derivative of the log prior density of an unconstrained coordinate."""
+    """Return first and second derivatives of the log prior density of a coordinate."""
     transform = dist.biject_to(prior.support)
 
     def log_density(x: Array) -> Array:
@@ -133,14 +133,14 @@ def _log_density_derivatives(prior: dist.Distribution, x: Array) -> tuple[Array,
 
 
 def as_priors(shared: Sequence[SharedParameter]) -> dict[str, tuple[Any, Any]]:
-    """What `Observations.shared` holds."""
+    """Return the entries of `Observations.shared`."""
     return {each.name: (np.asarray(each.mean), np.asarray(each.sd)) for each in shared}
 
 
 def of_priors(
     names: Sequence[str], priors: Mapping[str, dist.Distribution]
 ) -> list[SharedParameter]:
-    """The priors themselves as normal distributions, from which the search begins."""
+    """Approximate the priors by normal distributions, with which the search begins."""
     drawn = {name: np.asarray(_drawn(priors[name]), float) for name in names}
     return [SharedParameter(name, float(x.mean()), float(x.std())) for name, x in drawn.items()]
 
@@ -151,7 +151,7 @@ def estimate_shared(
     priors: Mapping[str, dist.Distribution],
     shared: Sequence[SharedParameter],
 ) -> list[SharedParameter]:
-    """The posterior of shared parameters, from the pixels that the method can be trusted in.
+    """Estimate the posterior of shared parameters from pixels with reliable draws.
 
     Modes are followed from step to step. The last step searches every pixel from all starts.
 
@@ -220,14 +220,14 @@ def estimate_shared(
 
 
 def _precision(information: np.ndarray) -> np.ndarray:
-    """One over the variance of each parameter; infinite where that is not positive."""
+    """Return the inverse variance of each parameter; infinite where it is not positive."""
     if not np.linalg.eigvalsh(information)[0] > 0.0:
         return np.full(len(information), np.inf)
     return 1.0 / np.diag(np.linalg.inv(information))
 
 
 class _Expectations(NamedTuple):
-    """Of every pixel: slope, its Monte Carlo error, information; mean and covariance of draws."""
+    """Score, its Monte Carlo error and information of each pixel; moments of its draws."""
 
     slope: np.ndarray
     error: np.ndarray
@@ -237,14 +237,14 @@ class _Expectations(NamedTuple):
 
 
 def _information_test(found: _Expectations) -> np.ndarray:
-    """White's test of each parameter by itself."""
+    """Return White's information matrix test of each parameter."""
     expected = np.diagonal(found.information, axis1=1, axis2=2) + found.error**2
     excess = found.slope**2 - expected
     return excess.sum(axis=0) / np.sqrt(np.sum((excess - excess.mean(axis=0)) ** 2, axis=0))
 
 
 def _sandwich_sd(slope: np.ndarray, prior: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    """Standard deviations that hold where slopes spread more than the information says."""
+    """Return sandwich standard deviations, which allow for excess scatter of the scores."""
     # They do where expectations have Monte Carlo errors, and where pixels do not agree.
     spread = prior + len(slope) * np.atleast_2d(np.cov(slope.T, ddof=0))
     inverse = np.linalg.inv(whole)
@@ -254,7 +254,7 @@ def _sandwich_sd(slope: np.ndarray, prior: np.ndarray, whole: np.ndarray) -> np.
 def _prior_derivatives(
     names: Sequence[str], priors: Mapping[str, dist.Distribution], at: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Slope of the log prior density of the coordinates, and minus its curvature."""
+    """Return the slope of the log prior density of coordinates, and minus its curvature."""
     with jax.enable_x64(True):
         found = [_log_density_derivatives(priors[n], x) for n, x in zip(names, at, strict=True)]
         first, second = np.array(found, float).T
@@ -267,7 +267,7 @@ def _expectations(
     shared: Sequence[SharedParameter],
     modes: np.ndarray | None,
 ) -> tuple[_Expectations, np.ndarray]:
-    """What each pixel says about the shared parameters, at the priors that they have now.
+    """Return each pixel's information about shared parameters at their present priors.
 
     The modes, (pixel, size), are where the search begins and where it has ended.
     """
@@ -299,7 +299,7 @@ def _expectations(
 
 
 def _resampled(weights: np.ndarray) -> np.ndarray:
-    """Indices of draws, each as often as it weighs: (pixel, draw)."""
+    """Return indices of draws resampled by weight, (pixel, draw)."""
     # In random order: every sixteenth of quasi-random points would not be spread like all of them.
     order = np.broadcast_to(np.arange(weights.shape[1]), weights.shape)
     order = np.random.default_rng(0).permuted(order, axis=1)
@@ -309,7 +309,7 @@ def _resampled(weights: np.ndarray) -> np.ndarray:
 
 
 def _coordinates(engine: CompiledModel, _: None) -> JitOnce:
-    """The program of unconstrained vectors of the draws of one pixel."""
+    """Make the program that returns unconstrained vectors of the draws of one pixel."""
 
     def of_pixel(data: Observations, draws: dict[str, Array]) -> Array:
         # A transform does not depend on readings.
@@ -319,12 +319,12 @@ def _coordinates(engine: CompiledModel, _: None) -> JitOnce:
 
 
 def _positions(program: Program, names: Sequence[str]) -> np.ndarray:
-    """Where numbers of these names stand in the unconstrained vector."""
+    """Return positions of parameters in the unconstrained vector."""
     return np.array([int(program.positions[name]) for name in names])
 
 
 def _slopes(engine: CompiledModel, names: tuple[str, ...]) -> JitOnce:
-    """The program of slope and information of one pixel."""
+    """Make the program that returns score and information of one pixel."""
     program = engine.program
     where = _positions(program, names)
 

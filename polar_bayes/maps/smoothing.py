@@ -1,4 +1,4 @@
-r"""A smoothness prior between neighbors of a map: an intrinsic Gaussian Markov random field.
+r"""Smoothness prior of neighboring pixels: an intrinsic Gaussian Markov random field.
 
 With $m_i, \sigma_i$ the posterior of one parameter in pixel i, the posterior of all pixels under
 the further prior $\exp(-\sum_{i \sim j} (x_i - x_j)^2 / 2 \tau^2)$ has the precision and mean
@@ -27,7 +27,7 @@ from polar_bayes.maps.lazy import checked_status, ensure_loaded
 
 
 def smooth(maps: xr.Dataset, name: str, neighbor_sd: float, *, seed: int = 0) -> xr.Dataset:
-    """A parameter of a map under a prior by which neighboring pixels differ little.
+    """Smooth a parameter of a map by a prior on the differences of neighboring pixels.
 
     The prior multiplies those of the pixels: the difference of each pixel from its neighbors above,
     below, left and right is normal with standard deviation `neighbor_sd`, wherever both have an
@@ -96,7 +96,7 @@ def smooth(maps: xr.Dataset, name: str, neighbor_sd: float, *, seed: int = 0) ->
 
 
 def _differences(is_known: np.ndarray) -> scipy.sparse.csr_array:
-    """The differences of neighbors that both have an answer, (pair, pixel)."""
+    """Return the difference matrix of neighbors that both have an answer, (pair, pixel)."""
     number = np.where(is_known, np.cumsum(is_known).reshape(is_known.shape) - 1, -1)
     neighbors = (number[1:], number[:-1]), (number[:, 1:], number[:, :-1])
     pairs = np.concatenate([np.stack(both, axis=-1).reshape(-1, 2) for both in neighbors])

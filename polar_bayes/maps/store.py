@@ -1,4 +1,4 @@
-"""Maps of images that do not fit into memory: block by block from file to file, resumable.
+"""Maps of images that do not fit into memory: written block by block, resumable.
 
 A map is a Zarr store that appears whole, without values, with the digest of its request in the
 attribute `lazy.REQUEST`. Each block is on the disk before its line is in the journal next to the
@@ -50,16 +50,16 @@ from polar_bayes.paths import as_path, is_same_file, replace_file, sync, tempora
 from polar_bayes.progress import Counter, no_progress, with_counter
 
 BLOCK = 65536
-"""Most pixels of a block, and of a chunk on the disk: few files, little memory."""
+"""Most pixels of a block, and of a chunk on the disk, which limits files and memory."""
 
 PARTS, LEAST = 4, 1024
-"""Blocks of a smaller image, so that every core has work, and the fewest pixels of one."""
+"""Number of blocks of a smaller image, so that every core has work; fewest pixels of a block."""
 
 READ = frozenset((*(row.name for row in CONTRACT), WAVELENGTH.name, *LABELS))
-"""Variables of a capture that a fit reads; known truths and other variables are not among them."""
+"""Variables of a capture that a fit reads; known truths are not among them."""
 
 JOURNAL = ".progress"
-"""Ending of the name of the journal, which lies next to an unfinished map."""
+"""Suffix of the journal's name, which lies next to an unfinished map."""
 
 METADATA = "zarr.json"
 
@@ -134,7 +134,7 @@ def map_file(
 
 
 def check_apart(source: Path, store: Path) -> None:
-    """Refuse a store that is the source, inside it or around it, or whose folder is missing."""
+    """Refuse a store that contains, or lies in, its source, or whose folder is missing."""
     where = str(store)
     with written(store):
         one, other = source.resolve(), store.resolve()
@@ -149,7 +149,7 @@ def check_apart(source: Path, store: Path) -> None:
 def fit_file_block(
     source: Path, region: Region, plan: MapPlan, opened: xr.Dataset | None = None
 ) -> tuple[xr.Dataset, str]:
-    """Fit one block of a capture, which a worker opens: its maps, and a digest of its readings."""
+    """Fit one block of a capture in a worker; return its maps and a digest of readings."""
     image = _open(source) if opened is None else opened
     block = with_pixel_numbers(image, region).load()
     with _in_capture(source, region):
@@ -157,14 +157,14 @@ def fit_file_block(
 
 
 def _open(source: Path) -> xr.Dataset:
-    """A capture from a file, with the variables that a fit reads."""
+    """Open a capture with the variables that a fit reads."""
     image = open_capture(source)
     return image[[name for name in image.data_vars if name in READ]]
 
 
 @contextlib.contextmanager
 def _in_capture(source: Path, region: Region | None = None) -> Iterator[None]:
-    """Errors of a capture, with its name and the block."""
+    """Add the name of the capture and the block to errors."""
     where = str(source) if region is None else f"{source}: block {_label(region)}"
     try:
         yield
@@ -175,7 +175,7 @@ def _in_capture(source: Path, region: Region | None = None) -> Iterator[None]:
 
 
 def _digest(block: xr.Dataset) -> str:
-    """Digest of what a fit reads of a block."""
+    """Return a digest of what a fit reads of a block."""
     names = sorted(READ & set(block.variables))
     return digest([(n, block[n].dims, block[n].to_numpy()) for n in names])
 
@@ -202,7 +202,7 @@ class _MapStore:
         self.request = digest(self.topics)
 
     def is_finished(self, *, resume: bool) -> bool:
-        """Whether the store is a finished map; a store of another request is refused."""
+        """Return whether the map is finished; refuse a store of another request."""
         where = str(self._store)
         if not os.path.lexists(self._store):
             return False
@@ -218,12 +218,12 @@ class _MapStore:
         return FINISHED in attributes
 
     def estimate(self) -> None:
-        """Complete the plan, which is not part of the request: the same image gives the same."""
+        """Complete the plan from the image; the result depends on the image alone."""
         self._plan = estimate_plan(self._plan, self._image)
         self._maps = blank(self._image, self._plan)
 
     def check_finished(self) -> None:
-        """Refuse a finished map of readings that have changed, or with missing chunks."""
+        """Refuse a finished map with changed readings or missing chunks."""
         where = str(self._store)
         readings = [_digest(self._image.isel(region)) for region in self._regions.values()]
         if _metadata(self._store)["attributes"][FINISHED] != digest(list(self._regions), readings):
@@ -236,7 +236,7 @@ class _MapStore:
             raise OutputError(what, where=where, hint=f"copy the store again, or {OTHER_OUT}")
 
     def check_readings(self, journal: Journal) -> None:
-        """Refuse to resume where the readings of a finished block have changed."""
+        """Refuse to resume if the readings of a finished block have changed."""
         for name, region in self._regions.items():
             if journal.done.get(name) not in (None, _digest(self._image.isel(region))):
                 what = f"the capture has changed since block {name} was fitted"
@@ -244,7 +244,7 @@ class _MapStore:
                 raise FitError(what, where=str(self._store), hint=hint)
 
     def begin(self, journal: Journal) -> None:
-        """Put the store without values in its place, or check that it is as it was put there."""
+        """Create the store without values, or check that it is unchanged."""
         with written(self._store), temporary_folder(self._store.parent) as folder:
             empty = folder / self._store.name
             self._write_blank(empty)
@@ -263,7 +263,7 @@ class _MapStore:
                 sync(self._store.parent)
 
     def _write_blank(self, path: Path) -> None:
-        """The store with names, axes and attributes; chunks not yet written read as not fitted."""
+        """Write names, axes and attributes; missing chunks mean that pixels are not fitted."""
         compressors = (ZstdCodec(), Crc32cCodec())
         encoding: dict = {str(name): {"compressors": compressors} for name in self._maps.variables}
         for name, value in FILL_VALUES.items():
@@ -279,7 +279,7 @@ class _MapStore:
         )
 
     def run(self, journal: Journal, source: Path, scheduler: str | None, progress: Counter) -> None:
-        """Fit and write every block that is not on the disk."""
+        """Fit and write every block that has not been written."""
         stored = xr.open_zarr(self._store, chunks=None, consolidated=False)
         regions = [
             region
@@ -301,7 +301,7 @@ class _MapStore:
                 progress(done, every)
 
     def _is_whole(self, stored: xr.Dataset, region: Region) -> bool:
-        """Whether every chunk of a block is there and has the checksum that it was written with."""
+        """Return whether every chunk of a block exists and has its recorded checksum."""
         if not all(file.is_file() for file in self._files(region)):
             return False  # it would be read as not fitted
         try:
@@ -311,7 +311,7 @@ class _MapStore:
         return True
 
     def _write(self, block: xr.Dataset, region: Region) -> None:
-        """Write a block and wait until it is on the disk."""
+        """Write a block, and wait until it is on the disk."""
         values = block.drop_vars(list(block.coords))
         values.to_zarr(self._store, region=region, consolidated=False, write_empty_chunks=True)
         files = self._files(region)
@@ -320,7 +320,7 @@ class _MapStore:
             sync(path)
 
     def _files(self, region: Region) -> list[Path]:
-        """Chunk files of a block: one of each array, as the default names of Zarr have it."""
+        """Return the chunk files of a block, one per array, by Zarr's default names."""
         found = []
         for name, variable in self._maps.data_vars.items():
             at = [region[d].start // self._chunks[d] if d in IMAGE else 0 for d in variable.dims]
@@ -341,7 +341,7 @@ class _MapStore:
 
 
 def _metadata(store: Path) -> dict[str, Any]:
-    """Metadata of a store, without attributes where they cannot be read."""
+    """Return the metadata of a store; empty if they cannot be read."""
     found: Any = {}
     with contextlib.suppress(OSError, ValueError):
         found = json.loads((store / METADATA).read_text())

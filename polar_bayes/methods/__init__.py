@@ -1,4 +1,4 @@
-"""Methods that make draws of a posterior, a file an algorithm: a fit loads its own and no other."""
+"""Methods that draw from a posterior, one file per algorithm; a fit loads only its own."""
 
 from polar_bayes.namespace import attach
 

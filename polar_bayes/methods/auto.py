@@ -1,4 +1,4 @@
-"""Automatic choice of a method: the cheapest whose own diagnostics accept its draws."""
+"""Automatic choice of a method: the cheapest that passes its own diagnostics."""
 
 import dataclasses
 import math
@@ -23,11 +23,11 @@ from polar_bayes.numerics.psis import MAX_PARETO_K, max_effective_size
 from polar_bayes.progress import Progress
 
 MARGIN, MOST_TIMES = 1.5, 16.0
-"""Draws of a second try: more than the first error asks for, but not above so many times."""
+"""Factor on the draws that the first error calls for in a second try; largest factor in all."""
 
 
 def expected_error(draws: PosteriorDraws, problem: Problem) -> float:
-    """Monte Carlo error of a mean or standard deviation that 1% of the fits exceed.
+    """Return the Monte Carlo error of a mean or sd that 1% of fits exceed.
 
     In posterior standard deviations; the largest of all parameters.
     """
@@ -36,7 +36,7 @@ def expected_error(draws: PosteriorDraws, problem: Problem) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Auto(AbstractMethod):
-    """The cheapest method whose own diagnostics say that it is good enough.
+    """The cheapest method that passes its own diagnostics.
 
     Methods are tried from cheap to exact: importance (of one material in one color), NUTS. One is
     taken when Pareto k is at most 0.7, R-hat at most 1.01, nothing diverged, no mode was left
@@ -66,7 +66,7 @@ class Auto(AbstractMethod):
             self.refuse(f"seconds is {self.seconds}", "give a time above 0, such as 60")
 
     def candidates(self, problem: Problem) -> dict[str, AbstractMethod]:
-        """What is tried for a capture, each with as many draws as it takes.
+        """Return the methods to try for a capture, each with the draws it needs.
 
         The order is that of their costs once all programs are compiled.
 
@@ -190,7 +190,7 @@ class Auto(AbstractMethod):
 
 
 class Attempt(NamedTuple):
-    """One method that was tried."""
+    """One attempt: a method, its result and its assessment."""
 
     name: str
     seconds: float
@@ -203,7 +203,7 @@ class Attempt(NamedTuple):
     ess: float = np.nan
 
     def as_metadata(self) -> Provenance:
-        """What JSON can hold."""
+        """Return the attempt in types of JSON."""
         numbers = ("seconds", "monte_carlo", "r_hat", "pareto_k", "ess")
         texts = {"name": self.name, "taken": self.taken, "why": self.why}
         return texts | {name: _rounded(getattr(self, name)) for name in numbers}
@@ -235,5 +235,5 @@ STUDY_METHODS: Mapping[str, AbstractMethod] = MappingProxyType(
         "nuts long": Nuts(warmup=1000, draws=4000, most_draws=4000),
     }
 )
-"""Methods that `polar_bayes.accuracy` compares. One more is one more value:
+"""Methods that `polar_bayes.accuracy` compares by default. To add one, pass
 `{**STUDY_METHODS, "mine": Mine()}`."""

@@ -44,35 +44,34 @@ from polar_bayes.numerics.psis import MAX_PARETO_K, smooth, weighted_ess
 from polar_bayes.observation.data import Observations
 
 HARD = 1024
-"""Pixels with further draws that are in memory at a time."""
+"""Number of pixels whose additional draws are in memory together."""
 
 LANES = 4
-"""Pixels of a batch that are computed together where each has hundreds of draws."""
+"""Pixels of a batch that are computed together when each has hundreds of draws."""
 
 SAME_MODE = 1e-3
-"""Two modes whose potentials differ by less count as one."""
+"""Difference of potentials below which two modes count as one."""
 
 LEAST_RIVAL, LEAST_DISTANCE = 0.02, 1.0
-"""Evidence of another mode, as a share of that of the heaviest, from which a pixel is fitted at all
-of its modes; and the distance, in posterior sds, from which it counts as another."""
+"""Evidence of another mode, relative to the heaviest, from which all modes of a pixel are used; its
+least distance in posterior sds."""
 
 SMALL_IMAGE, SAMPLE, MOST_MISSED = 2048, 512, 0.01
-"""Pixels of an image that is searched from all starts; pixels of a larger one on which starts are
-compared; share of them in which one start misses a mode though its weights look good, up to which
-one start serves."""
+"""Largest image that is searched from all starts; number of pixels of a larger one that compare
+starts; largest share of pixels in which a single start may miss a mode undetected."""
 
 ARM, LONGEST_ARM, MOST_IN_ARM = 2.5, 8.0, 0.025
-"""Distance along the profile of a coordinate, in sds of a proposal, where an arm of the posterior
-begins, and to which it is looked for; the share of a profile in arms, .012 of a normal one, above
-which the proposal misses one."""
+"""Distance along a profile, in sds of the proposal, where a long tail begins, and where the search
+for it ends; largest share of a profile in such tails (.012 for a normal one) that the proposal may
+miss."""
 
 STUDENT_T_FACTOR = 2
-"""Draws of a Student t proposal for each draw of the normal approximation."""
+"""Number of draws of a Student t proposal per draw of the normal approximation."""
 
 NORMAL_SHARE, STUDENT_T_SHARE = 0.6, 0.4
-"""Least effective sample size of weighted draws, as a share of their number. Pareto k does not see
-an arm of the posterior that no draw has reached, but the effective draws are few where there is
-one: docs/maps.md has the measurement. The longer tails of Student t distributions cost draws."""
+"""Least effective sample size of weighted draws, relative to their number. Pareto k cannot detect a
+tail of the posterior that no draw has reached, but a small effective sample size can: docs/maps.md
+has the measurement. The longer tails of Student t distributions cost draws."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +118,7 @@ class CorrectedLaplace(AbstractBatchMethod):
     def run_batch(
         self, batch: ProblemBatch, known: np.ndarray | None = None
     ) -> Iterator[BatchDraws]:
-        """The same as of other methods; `known` modes, (pixel, size), are where searches begin."""
+        """Draw from many posteriors; searches start at `known` modes, (pixel, size), if given."""
 
         def sample(which: np.ndarray) -> Iterator[BatchDraws]:
             if self.sampler is not None and which.size:
@@ -167,13 +166,13 @@ class Approximation(NamedTuple):
 
     @property
     def is_trusted(self) -> np.ndarray:
-        """Whether the weights correct the errors of the approximation, (pixel,)."""
+        """True if the weights correct the errors of the approximation, (pixel,)."""
         enough = weighted_ess(self.weights) >= NORMAL_SHARE * self.weights.shape[1]
         return self.search.converged & (self.pareto_k <= MAX_PARETO_K) & enough
 
     @property
     def has_rival(self) -> np.ndarray:
-        """Whether another mode was found that weighs too much to be left out, (pixel,)."""
+        """True if another mode has too much weight to be left out, (pixel,)."""
         return self.rival - self.search.mode.log_evidence > math.log(LEAST_RIVAL)
 
 
@@ -188,7 +187,7 @@ class _Run:
         self.rotations = random_rotations(batch.keys, size)
 
     def approximate(self, known: np.ndarray | None = None) -> Approximation:
-        """Fit from the best candidate; untrusted pixels start again and keep the lower mode.
+        """Fit from the best candidate; untrusted pixels restart and keep the lower mode.
 
         With known starts, (pixel, size), each pixel is fitted from its own alone.
         """
@@ -220,7 +219,7 @@ class _Run:
         return found
 
     def _weigh(self, which: np.ndarray, search: ModeSearch) -> Approximation:
-        """Draws of the normal approximations, and their weights."""
+        """Draw from the normal approximations, and weight the draws."""
         proposal = _proposal_at(search.mode).rotated(self.rotations[which])
         parameters, ratios = self._draw(which, proposal, self.points)
         return Approximation(search, parameters, *smooth(ratios), np.full(which.size, -np.inf))
@@ -228,12 +227,12 @@ class _Run:
     def _draw(
         self, which: np.ndarray, proposal: Proposal, points: Points
     ) -> tuple[Values, np.ndarray]:
-        """Draws of the proposal of every pixel, and their log importance ratios."""
+        """Draw from the proposal of every pixel; return draws and log importance ratios."""
         states, given = (tuple(np.float32(x) for x in each) for each in (proposal, points))
         return self.batch.subset(which).run(_draws, None, *states, given=given, single=True)
 
     def _begin_draws(self) -> None:
-        """Compile while modes are searched."""
+        """Begin to compile the draws while modes are searched."""
         size = self.points.z.shape[1]
         shapes = (1, size), (1, size, size), self.points.z.shape, self.points.log_density.shape
         *states, z, log_density = (np.zeros(shape, np.float32) for shape in shapes)
@@ -241,7 +240,7 @@ class _Run:
         self.batch.begin(_draws, None, *states, given=given, single=True)
 
     def answers(self, found: Approximation) -> Iterator[BatchDraws]:
-        """Normal approximations, corrected by their weights where these can be trusted."""
+        """Yield normal approximations, corrected by their weights where these are reliable."""
         converged = found.search.converged
         lost = take_rows(found.search, ~converged)
         no_root = np.full_like(lost.mode.root, np.nan)
@@ -270,7 +269,7 @@ class _Run:
     def adapt(
         self, which: np.ndarray, normal: Approximation
     ) -> Generator[BatchDraws, None, np.ndarray]:
-        """Fit proposals to their own weighted draws; returns which have no answer after that."""
+        """Fit proposals to their weighted draws; return pixels that have no answer then."""
         left, points, weights = np.arange(which.size), self.points, normal.weights
         proposal = _proposal_at(normal.search.mode).rotated(self.rotations[which])
         for _ in range(self.settings.rounds):
@@ -295,7 +294,7 @@ class _Run:
         return left
 
     def _has_arm(self, which: np.ndarray, proposal: Proposal) -> np.ndarray:
-        """Whether the posterior goes on along an axis, where the proposal has ended, (pixel,)."""
+        """Return whether the posterior extends along an axis beyond the proposal, (pixel,)."""
         size, draws = self.points.z.shape[1], self.settings.draws
         steps = np.linspace(0.0, LONGEST_ARM, draws // (2 * size))
         if steps.size < 2:
@@ -316,12 +315,12 @@ class _Run:
 
 
 def _proposal_at(mode: NormalApproximation) -> Proposal:
-    """The normal approximation as a proposal."""
+    """Return the normal approximation as a proposal."""
     return Proposal(np.asarray(mode.z), np.asarray(mode.root))
 
 
 def _draws(engine: CompiledModel, _: None) -> JitOnce:
-    """The program that draws from the proposal of one pixel."""
+    """Make the program that draws from the proposal of one pixel."""
     program = engine.single_program
 
     def draws(

@@ -174,16 +174,16 @@ class Importance(AbstractMethod):
 
 
 ONE_ROUND = Importance(rounds=1)
-"""Draws that check others, or serve a comparison."""
+"""Settings of draws that check other draws, or serve a comparison."""
 
 
 def suits_profiles(problem: Problem) -> bool:
-    """Whether draws along all profiles are few enough to serve as a check."""
+    """Return whether draws along all profiles are few enough to serve as a check."""
     return problem.program.size <= MOST_COORDINATES
 
 
 def tail_shares(problem: Problem, parameters: Values, key: Array) -> Provenance:
-    """Shares of weighted draws beyond the 95% intervals of chains, an entry of the provenance.
+    """Return weighted shares beyond the 95% intervals of chains, for the provenance.
 
     Chains that never entered an arm of the posterior agree with each other; draws along its
     profiles reach the arm. Empty where such draws do not suit the problem.
@@ -207,7 +207,7 @@ def tail_shares(problem: Problem, parameters: Values, key: Array) -> Provenance:
 
 
 class Rounds:
-    """Draws of one posterior in all rounds, weighted over the mean density of their proposals."""
+    """Draws of all rounds of one posterior, weighted by the mean density of their proposals."""
 
     def __init__(self, settings: Importance, proposal: Mixture, key: Array) -> None:
         self._draws, self._rounds = settings.draws, settings.rounds
@@ -221,7 +221,7 @@ class Rounds:
 
     @property
     def is_open(self) -> bool:
-        """Whether a further round is needed, and there are draws to which it can be fitted."""
+        """True if a further round is needed, and there are draws to which it can be fitted."""
         return self._next is not None
 
     @property
@@ -231,11 +231,11 @@ class Rounds:
 
     @property
     def log_posterior(self) -> Float[np.ndarray, " draw"]:
-        """Their log posterior densities."""
+        """Log posterior densities of the draws of all rounds."""
         return np.concatenate(self._log_posterior)
 
     def draw(self) -> np.ndarray:
-        """Draws of the next proposal, (draw, size), which `weigh` takes next."""
+        """Draw from the next proposal, (draw, size); call `weigh` with their densities next."""
         assert self._next is not None
         self._key, key = split_key(self._key)
         proposal = self._next
@@ -250,7 +250,7 @@ class Rounds:
         return z
 
     def weigh(self, log_posterior: np.ndarray, parameters: Values | None = None) -> None:
-        """Weigh the last draws by their densities, all others anew, and fit the next proposal."""
+        """Add densities of the last draws, update all weights, and fit the next proposal."""
         self._log_posterior.append(log_posterior)
         self._parameters.append(parameters or {})
         mean = scipy.special.logsumexp(self._log_proposals, axis=0) - math.log(len(self.proposals))
@@ -264,11 +264,11 @@ class Rounds:
 
     @property
     def is_finite(self) -> bool:
-        """Whether any draw has a density."""
+        """True if any draw has a finite density."""
         return bool(np.isfinite(self.weights).all())
 
     def answer(self, at: np.ndarray, mode: tuple[AnyArray, AnyArray]) -> BatchDraws:
-        """All draws as those of the capture at one place of a batch."""
+        """Return all draws as those of the capture at one place of a batch."""
         if not self.is_finite:
             return BatchDraws(at, Status.NOT_CONVERGED, pareto_k=self.pareto_k, mode=mode)
         return BatchDraws(
@@ -283,7 +283,7 @@ class Rounds:
         )
 
     def _fit(self, log_ratios: np.ndarray) -> Mixture:
-        """A mixture for the next round."""
+        """Fit the mixture of the next round."""
         self._key, key = split_key(self._key)
         z = self.z
         weights = _temper(log_ratios, 10 * z.shape[1])  # effective draws that a fit needs
@@ -304,7 +304,7 @@ def _log_densities(proposal: Mixture, z: Array) -> Array:
 
 
 def _temper(log_ratios: np.ndarray, least: float) -> np.ndarray:
-    """Weights, raised to the largest power up to 1 that leaves so large an effective sample."""
+    """Raise weights to the largest power up to 1 that gives the effective sample size."""
     relative = log_ratios - np.max(log_ratios)
 
     def weights(power: float) -> np.ndarray:
@@ -331,7 +331,7 @@ def _propose(proposal: Mixture, count: int, key: Array) -> tuple[Array, Array]:
 def profile_mixtures(
     batch: ProblemBatch, owner: np.ndarray, modes: NormalApproximation
 ) -> dict[int, Mixture]:
-    """The first proposal of every pixel from its modes, the heaviest of which come first."""
+    """Yield the first proposal of every pixel, given its modes, heaviest first."""
     first, inverse = np.unique(owner, return_index=True, return_inverse=True)[1:]
     weight = np.exp(modes.log_evidence - modes.log_evidence[first][inverse])
     heavy = weight >= LEAST_WEIGHT * np.bincount(inverse, weight)[inverse]

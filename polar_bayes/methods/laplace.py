@@ -94,7 +94,7 @@ class Laplace(AbstractMethod):
 
 
 def _normal_draws(engine: CompiledModel, count: int) -> JitOnce:
-    """The program that draws from the approximation of one capture."""
+    """Make the program that draws from the approximation of one capture."""
 
     def draw(data: Observations, z: Array, root: Array, key: Array) -> Values:
         noise = jax.random.normal(key, (count, len(z)), z.dtype)

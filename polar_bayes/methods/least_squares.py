@@ -62,7 +62,7 @@ def _solver(compiled_model: CompiledModel, _: None) -> JitOnce:
 
 
 class Estimate(NamedTuple):
-    """The best of several fits."""
+    """The best of several fits, with what the covariance needs."""
 
     z: Float[Array, " size"]
     covariance: Float[Array, "size size"]
@@ -71,7 +71,7 @@ class Estimate(NamedTuple):
 
 
 def estimate(program: Program, data: Observations, starts: Float[Array, "start size"]) -> Estimate:
-    """Levenberg-Marquardt from several starts; the scatter is re-estimated after the first pass."""
+    """Run Levenberg-Marquardt from several starts, and re-estimate the scatter after one pass."""
 
     def residuals(z: Array, unit: Array) -> Array:
         parts = program.residuals(z, data)
@@ -115,7 +115,7 @@ def estimate(program: Program, data: Observations, starts: Float[Array, "start s
 
 
 def standard_errors(program: Program, estimate: Estimate) -> dict[str, list[float | None]]:
-    """Standard errors of the parameters in their physical range, by the delta method."""
+    """Return standard errors of parameters in their physical range, by the delta method."""
     infinite = np.isinf(np.diagonal(estimate.covariance))
     covariance = np.where(np.isinf(estimate.covariance), 0.0, estimate.covariance)
     errors = {}

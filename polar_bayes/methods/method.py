@@ -1,4 +1,4 @@
-"""The contract of methods: a problem in, posterior draws out."""
+"""The interface of methods: a problem in, posterior draws out."""
 
 import abc
 import dataclasses
@@ -36,7 +36,7 @@ from polar_bayes.repr_html import HTMLRepr
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PosteriorDraws:
-    """Draws from one posterior, and how far they can be trusted.
+    """Draws from one posterior, with their diagnostics.
 
     Args:
         method: Name of the method that made them.
@@ -70,7 +70,7 @@ class PosteriorDraws:
 
     @property
     def doubts(self) -> list[str]:
-        """The problems, and divergences, which the statistics of a result show by themselves."""
+        """Problems of the draws, and divergences, which statistics of a result show."""
         diverging = self.stats.get("diverging", np.zeros(0))
         count = int(np.sum(diverging))
         return [*self.problems, *([f"{count} of {diverging.size} draws diverged"] if count else [])]
@@ -78,7 +78,7 @@ class PosteriorDraws:
     def standard_errors(
         self, describe: Callable[[np.ndarray], np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Monte Carlo standard errors of means and standard deviations, in standard deviations.
+        """Return Monte Carlo standard errors of means and sds, in posterior sds.
 
         Args:
             describe: From draws of shape (chain, draw, size) to scalars of shape
@@ -97,7 +97,7 @@ class PosteriorDraws:
 
 
 _THREADS = ThreadPoolExecutor(THREADS, "polar_bayes fits")
-"""That fit captures one after another, of all blocks at once: a core is not shared by two."""
+"""Threads that fit captures of all blocks, so that fits do not compete for a core."""
 
 SYNONYMS = {
     "num_chains": "chains",
@@ -110,7 +110,7 @@ SYNONYMS = {
     "target_accept_prob": "target_acceptance",
     "tune": "warmup",
 }
-"""What NumPyro, PyMC and others call settings."""
+"""Names of settings in NumPyro, PyMC and others, and the names here."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,13 +118,13 @@ class AbstractBatchMethod(HTMLRepr, abc.ABC):
     """A way to fit many captures of one layout; a small frozen dataclass of settings."""
 
     memory_limit: ClassVar[int] = 1024
-    """Captures whose draws are in memory at a time."""
+    """Number of captures whose draws are in memory together."""
 
     group_size: ClassVar[int] = 64
-    """Captures that one thread or worker fits at a time, and that a crash can lose."""
+    """Captures that a thread or worker fits together; a crash loses at most these."""
 
     def __new__(cls, *_: object, **settings: object) -> Self:
-        """Refuse a setting that it does not have, naming the one that is meant."""
+        """Refuse unknown settings, and suggest the setting that is probably meant."""
         found = [*inspect.signature(cls.__init__).parameters.values()][1:]
         if any(each.kind is each.VAR_KEYWORD for each in found):
             return super().__new__(cls)
@@ -149,7 +149,7 @@ class AbstractBatchMethod(HTMLRepr, abc.ABC):
         """
 
     def fit_batch(self, batch: ProblemBatch) -> Iterator[BatchDraws]:
-        """The same, with a status of those that have too few views."""
+        """Fit a batch; captures with too few views have a status instead of draws."""
         views = batch.pixels.views
         few = views < MIN_VIEWS
         yield BatchDraws(
@@ -162,7 +162,7 @@ class AbstractBatchMethod(HTMLRepr, abc.ABC):
     def for_image(
         self, size: int, sample: Callable[[int], ProblemBatch], *, is_shared: bool
     ) -> tuple[Self, Provenance]:
-        """Settings for an image, and entries of its provenance.
+        """Return settings that suit an image, and entries of its provenance.
 
         `size` is the number of its pixels, `sample` gives some of them drawn at random, and
         `is_shared` says whether pixels share parameters.
@@ -183,7 +183,7 @@ class AbstractBatchMethod(HTMLRepr, abc.ABC):
 
 @dataclasses.dataclass(frozen=True)
 class AbstractMethod(AbstractBatchMethod):
-    """A way to draw from the posterior of one capture; of many it fits one after another."""
+    """A way to draw from the posterior of one capture; many are fitted one after another."""
 
     group_size: ClassVar[int] = 4
 
@@ -205,12 +205,12 @@ class AbstractMethod(AbstractBatchMethod):
 
     @property
     def num_draws(self) -> int | None:
-        """Draws that the method makes, at least; None where their number is not a setting."""
+        """Least number of draws of the method; None if it is not a setting."""
         draws = getattr(self, "draws", None)
         return draws if isinstance(draws, int) else None
 
     def scale_draws(self, factor: float) -> Self | None:
-        """The same method with a multiple of its draws.
+        """Return the method with a multiple of its draws.
 
         Args:
             factor: Above 0.
@@ -227,7 +227,7 @@ class AbstractMethod(AbstractBatchMethod):
         return dataclasses.replace(self, **changed)
 
     def prepare(self, problem: Problem) -> None:
-        """Begin to compile what `run` needs, in parallel with the search for modes.
+        """Begin to compile what `run` needs, during the search for modes.
 
         Args:
             problem: The capture and its model.
@@ -241,14 +241,14 @@ class AbstractMethod(AbstractBatchMethod):
     def for_comparison(
         self, problem: Problem, draws: PosteriorDraws
     ) -> tuple["AbstractMethod", ...]:
-        """Methods for the capture with less of the instrument, once these draws are made.
+        """Return methods for the comparison fits that follow these draws.
 
         The first that trusts its draws is taken, and else the last.
         """
         return (self,)
 
     def cross_check(self, problem: Problem, parameters: Values, key: Array) -> Provenance:
-        """What other draws of the same posterior say of those of this method.
+        """Return what other draws of the same posterior say about these draws.
 
         `polar_bayes.fit` asks for it; simulations of many fits do not.
 
@@ -264,7 +264,7 @@ class AbstractMethod(AbstractBatchMethod):
 
     @override
     def run_batch(self, batch: ProblemBatch) -> Iterator[BatchDraws]:
-        """Fit one capture after another; the draws of each are nearly independent."""
+        """Fit captures one after another; the draws of each are nearly independent."""
         # Chains are thinned to every k-th draw, where k is the number of draws over the smallest
         # bulk effective sample size of all parameters, rounded up. A fit that must not be trusted
         # gives its draws all the same.
@@ -315,7 +315,7 @@ def assess_draws(draws: PosteriorDraws, parameters: Values) -> tuple[Status, flo
 
 
 def thin_draws(parameters: Values, effective: float) -> dict[str, np.ndarray]:
-    """Nearly independent finite draws of all chains: by name, (draw, ...)."""
+    """Return nearly independent finite draws of all chains by name, (draw, ...)."""
     finite = finite_draws(parameters)
     step = int(np.ceil(finite.size / np.clip(effective, 1.0, finite.size)))
     chosen = np.zeros_like(finite)
@@ -326,13 +326,13 @@ def thin_draws(parameters: Values, effective: float) -> dict[str, np.ndarray]:
 
 
 def finite_draws(parameters: Values) -> np.ndarray:
-    """Which draws are finite in all parameters, (chain, draw)."""
+    """Return True for draws that are finite in all parameters, (chain, draw)."""
     finite = [np.isfinite(np.asarray(x)) for x in parameters.values()]
     return np.all([x.all(axis=tuple(range(2, x.ndim))) for x in finite], axis=0)
 
 
 def flatten(parameters: Values) -> np.ndarray:
-    """Every scalar of parameters of shape (chain, draw, ...): (scalar, chain, draw)."""
+    """Stack every scalar of parameters (chain, draw, ...) as (scalar, chain, draw)."""
     flat = [np.asarray(x, float).reshape(*np.shape(x)[:2], -1) for x in parameters.values()]
     return np.moveaxis(np.concatenate(flat, axis=-1), -1, 0)
 
@@ -341,12 +341,12 @@ def flatten(parameters: Values) -> np.ndarray:
 
 
 def make_method(name: str) -> Any:
-    """The method of a name, with its default settings."""
+    """Return the method of a name, with its default settings."""
     return getattr(methods, METHODS[name].settings)()
 
 
 def find_method(method: object, where: str, *, one: bool = False, many: bool = False) -> Any:
-    """The settings that a caller asks for, by name or as they are.
+    """Return the settings of a caller, given by name or as a value.
 
     Raises:
         FitError: There is no such method, or it cannot do what is asked for.
@@ -370,6 +370,6 @@ def find_method(method: object, where: str, *, one: bool = False, many: bool = F
 
 
 def name_of(method: object) -> str:
-    """The name of a method, whatever its settings; that of its class where it has none."""
+    """Return the name of a method, or of its class if it has none."""
     made = type(method).__name__
     return next((name for name, each in METHODS.items() if each.settings == made), made)

@@ -135,11 +135,11 @@ class Nuts(AbstractMethod):
         return tail_shares(problem, parameters, key)
 
     def _sampler(self, target: Target, problem: Problem) -> "Sampler":
-        """The compiled sampler of these settings."""
+        """Return the compiled sampler of these settings."""
         return problem.compiled_model.made(_make_sampler, (target.density, self.static(target)))
 
     def static(self, target: Target) -> "Static":
-        """What a sampler is compiled for; the target supplies what the settings leave open."""
+        """Return what a sampler is compiled for; the target supplies settings left open."""
         warmup, acceptance = self.warmup, self.target_acceptance
         return Static(
             warmup=target.warmup if warmup is None else warmup,
@@ -170,7 +170,7 @@ def _make_sampler(_: CompiledModel, settings: tuple[AbstractDensity, "Static"]) 
 
 
 class Step(NamedTuple):
-    """One draw with its statistics; or a stack of them."""
+    """One draw with its statistics, or a stack of them."""
 
     z: Float[Array, " size"]
     diverging: Array
@@ -187,7 +187,7 @@ def sample(
     settings: Nuts,
     progress: Callable[[float], None] = lambda _: None,
 ) -> tuple[np.ndarray, dict[str, np.ndarray], bool, int]:
-    """Draws (chain, draw, size), statistics, whether the goals were reached, halvings of steps."""
+    """Return draws (chain, draw, size), statistics, whether goals were met, and step halvings."""
     warmup = sampler.static.warmup
     states = [sampler.init(target, key, chain) for chain in range(settings.chains)]
     # Compiled before the threads start: all then share one executable.
@@ -236,7 +236,7 @@ def _until_converged(
     advance_all: Callable[[list[infer.hmc.HMCState]], tuple[list[infer.hmc.HMCState], Step]],
     settings: Nuts,
 ) -> list[infer.hmc.HMCState]:
-    """Add blocks of draws to `rounds` until the goals or the limit of the settings are reached.
+    """Extend `rounds` by blocks of draws until the goals or the limit are reached.
 
     A divergence ends it, too, since no further draws make up for it, after as many draws as are
     asked for at least or a multiple of them: what is drawn does not depend on the block.
@@ -257,7 +257,7 @@ def _stacked(rounds: list[Step]) -> Step:
 
 
 def _pooled(states: list[infer.hmc.HMCState]) -> list[infer.hmc.HMCState]:
-    """The states with the mean of their metrics and the geometric mean of their step sizes.
+    """Return states with the mean of their metrics and the geometric mean of step sizes.
 
     All draws of the warm-up tell both better than a quarter of them, and no thread waits for the
     chain with the shortest steps.
@@ -284,7 +284,7 @@ def _with_half_the_step(state: infer.hmc.HMCState) -> infer.hmc.HMCState:
 
 
 def _converged(rounds: list[Step], settings: Nuts) -> bool:
-    """Whether every coordinate has reached the goals; both are invariant to monotone maps."""
+    """Return whether all coordinates meet the goals, which monotone maps do not change."""
     z = np.asarray(_stacked(rounds).z)
     bulk, tail, r_hat = measure(np.moveaxis(z, -1, 0))
     smallest = min(bulk.min(), tail.min())
@@ -292,7 +292,7 @@ def _converged(rounds: list[Step], settings: Nuts) -> bool:
 
 
 class Static(NamedTuple):
-    """What is fixed when a sampler is compiled."""
+    """Settings that are fixed when a sampler is compiled."""
 
     warmup: int
     acceptance: float
@@ -302,7 +302,7 @@ class Static(NamedTuple):
 
 
 class Sampler:
-    """NumPyro's NUTS as two functions of arrays: start a chain, advance it by a block."""
+    """NumPyro's NUTS as two functions of arrays: start a chain, and advance it by a block."""
 
     def __init__(self, density: AbstractDensity, static: Static) -> None:
         self.static = static
@@ -314,7 +314,7 @@ class Sampler:
         self._begin = compiled(self._start)
 
     def init(self, target: Target, key: Array, chain: int) -> infer.hmc.HMCState:
-        """The state of one of the chains that share a key."""
+        """Return the initial state of one of the chains that share a key."""
         value, gradient = target.potential(target.starts[chain])
         density = np.asarray(value, target.starts.dtype), np.asarray(gradient)
         return self._begin(target.starts, chain, density, target.metric, target.given, key)
@@ -346,7 +346,7 @@ class Sampler:
     def _advance(
         self, state: infer.hmc.HMCState, given: object, draws: Array
     ) -> tuple[infer.hmc.HMCState, Step]:
-        """The state after some draws, and these; the rest of a block is zero."""
+        """Return the state after some draws, and a block of draws padded with zeros."""
 
         def step(state: infer.hmc.HMCState) -> tuple[infer.hmc.HMCState, Step]:
             state = self._next(state, model_args=(given,))

@@ -33,27 +33,29 @@ from polar_bayes.numerics.optimize import (
 )
 
 LEAST_WEIGHT = 1e-3
-"""Share of the Laplace evidence; modes of less get no draws."""
+"""Smallest share of the Laplace evidence of a mode that gets draws."""
 
 LARGEST_DROP = 4.5
-"""Of a log marginal density along its profile: that of a normal distribution at three sds."""
+"""Largest drop of a log marginal density along its profile: a normal one's at three sds."""
 
 FIRST_STEP, GROWTH, MOST_STEPS = 1.5, 1.5, 8
-"""Of a profile: the first in posterior sds, each longer than the one before; 74 sds in all."""
+"""First step along a profile in posterior sds, ratio of successive steps, and number of steps;
+together they reach 74 sds."""
 
 WIDEST = 3.0
-"""Standard deviations at a point, at most, in units of those of the prior; of those at the mode
-where the curvature is not positive definite, so that it says nothing of them."""
+"""Largest standard deviations of a component, in those of the prior, or, where the curvature is not
+positive definite and so determines none, in those at the mode."""
 
 MOST_COORDINATES = 20
-"""Posteriors of more coordinates are described by their modes alone."""
+"""Largest number of coordinates along which profiles are computed."""
 
 COMPONENTS = 64
-"""Of the mixture, or a multiple: one program draws from those of most posteriors."""
+"""Number of components is rounded up to a multiple of this, so that most posteriors share one
+compiled program."""
 
 
 class Components(NamedTuple):
-    """Normal distributions, and the number of the peak that each belongs to."""
+    """Normal components, and the index of the peak that each belongs to."""
 
     peak: Int[np.ndarray, " component"]
     z: Float[np.ndarray, "component size"]
@@ -70,16 +72,19 @@ class Components(NamedTuple):
 
 
 Conditional = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Modes of all coordinates but one, (row, size), the potentials there, and the Hessians."""
+"""Conditional modes, (row, size), with their potentials and Hessians."""
 
 ConditionalModes = Callable[[np.ndarray, np.ndarray, np.ndarray], Conditional]
-"""From numbers of peaks, (row,), vectors near the modes, and the coordinate that stays of each."""
+"""Function that finds modes with one coordinate held.
+
+Its arguments are indices of peaks, (row,), start vectors, and indices of the held coordinates.
+"""
 
 
 def profile_components(
     peaks: Components, axes: np.ndarray, prior_sd: np.ndarray, conditional: ConditionalModes
 ) -> Components:
-    """Normal distributions at every peak, and along its profiles.
+    """Return normal components at every peak and along its profiles.
 
     Args:
         peaks: Those at the modes, each a peak of its own.
@@ -121,7 +126,7 @@ def profile_components(
 
 
 def mixture_of(components: Components, dtype: DTypeLike) -> Mixture:
-    """The mixture of components, each as heavy as the square root of its evidence."""
+    """Return the mixture of components, weighted by the square root of their evidence."""
     # The square root: tails need more draws than they weigh.
     share = np.exp(0.5 * (components.log_evidence - components.log_evidence.max()))
     which = np.resize(np.arange(share.size), COMPONENTS * -(-share.size // COMPONENTS))
@@ -138,7 +143,7 @@ def mixture_of(components: Components, dtype: DTypeLike) -> Mixture:
 
 
 def profile_mixture(coordinates: Coordinates) -> Mixture:
-    """Components at every heavy mode of one capture, and along its profiles."""
+    """Return the mixture at every heavy mode of one capture, and along its profiles."""
     modes = coordinates.modes
     # Of the fit: modes are searched in double precision.
     dtype = jax.dtypes.canonicalize_dtype(modes.z.dtype)
@@ -151,7 +156,7 @@ def profile_mixture(coordinates: Coordinates) -> Mixture:
 
     @functools.cache
     def given_one(at: int, fixed: int) -> np.ndarray:
-        """The factor of the covariance of the other coordinates."""
+        """Return a factor of the covariance of all coordinates but one."""
         return conditional_normal(covariance[at], fixed)[1]
 
     def conditional(peak: np.ndarray, z: np.ndarray, axis: np.ndarray) -> Conditional:

@@ -1,4 +1,4 @@
-"""The methods by name: one name is one algorithm with one set of defaults, in every verb.
+"""Methods by name; each name is one algorithm with one set of defaults in every verb.
 
 The table loads no method, and no JAX.
 """
@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 @dataclasses.dataclass(frozen=True)
 class MethodEntry:
-    """What is known of a method before it is loaded.
+    """Properties of a method that are known before it is loaded.
 
     Args:
         settings: Its class in `polar_bayes.methods`, whose default values are those of the name.
@@ -51,7 +51,7 @@ FIT_DEFAULT, MAP_DEFAULT = "nuts", "corrected-laplace"
 
 
 def method_names(*, one: bool = False, many: bool = False) -> tuple[str, ...]:
-    """Names of the methods that can do what is asked for."""
+    """Return the names of methods with certain abilities."""
     return tuple(
         name for name, entry in METHODS.items() if entry.fits_one >= one and entry.fits_many >= many
     )

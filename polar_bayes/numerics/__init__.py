@@ -1,1 +1,1 @@
-"""Functions of arrays, which know no capture, scene or model."""
+"""Numerical methods: functions of arrays, independent of captures, scenes and models."""

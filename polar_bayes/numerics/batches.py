@@ -1,4 +1,4 @@
-"""Rows of arrays, and functions of a fixed number of rows over any number of them."""
+"""Functions of a fixed number of rows, applied to any number of rows."""
 
 from collections.abc import Callable, Iterator
 
@@ -10,18 +10,18 @@ AnyArray = Array | np.ndarray
 
 
 def take_rows[T](values: T, which: np.ndarray | slice) -> T:
-    """Some pixels of arrays that all begin with the pixel axis."""
+    """Select pixels of arrays that all begin with the pixel axis."""
     return jax.tree.map(lambda x: np.asarray(x)[which], values)
 
 
 def put_rows[T](values: T, which: np.ndarray | slice, new: T) -> None:
-    """Replace some pixels of arrays that all begin with the pixel axis."""
+    """Replace pixels of arrays that all begin with the pixel axis, in place."""
     for whole, part in zip(jax.tree.leaves(values), jax.tree.leaves(new), strict=True):
         whole[which] = part
 
 
 def batches(count: int, size: int) -> Iterator[np.ndarray]:
-    """Indices of batches of one size; the last is filled up with the last pixel."""
+    """Yield indices of batches of one size; the last batch repeats the last pixel."""
     for begin in range(0, count, size):
         yield np.minimum(np.arange(begin, begin + size), count - 1)
 
@@ -29,7 +29,7 @@ def batches(count: int, size: int) -> Iterator[np.ndarray]:
 def map_batches[T](
     function: Callable[[np.ndarray], T], count: int, size: int, over: Callable = map
 ) -> T:
-    """Results of a function of the indices of one batch, joined along the pixel axis."""
+    """Apply a function of the indices of one batch, and join results along the pixel axis."""
     # Each part is put in its place as it comes: two copies of all results may not fit into memory.
     joined: T | None = None
     parts = over(lambda index: jax.tree.map(np.asarray, function(index)), batches(count, size))
@@ -43,7 +43,7 @@ def map_batches[T](
 
 
 def map_elements(function: Callable, values: np.ndarray, size: int) -> np.ndarray:
-    """A function of numbers, of an array of any shape: it is given `size` of them at a time."""
+    """Apply an elementwise function to an array of any shape, `size` elements at a time."""
     flat = np.ravel(values)
     if not flat.size:
         return np.zeros(np.shape(values))

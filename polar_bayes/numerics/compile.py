@@ -26,7 +26,7 @@ from polar_bayes.paths import compiled_folder, make_private
 from polar_bayes.progress import Progress
 
 COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
-"""XLA's optimization level, of 0 to 3: fits run as fast as with 3, and the first one of a layout
+"""XLA's optimization level, of 0 to 3: fits run as fast as with 3, and the first fit of a layout
 takes three quarters of the time."""
 
 CONTAINER_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
@@ -41,7 +41,7 @@ class AbandonedError(Exception):
 _ABANDONED: contextvars.ContextVar[threading.Event | None] = contextvars.ContextVar(
     "polar_bayes_abandoned", default=None
 )
-"""In a thread with a deadline: set when the deadline has passed."""
+"""Event of a thread with a deadline, set when the deadline has passed."""
 
 
 class _TracingLock:
@@ -61,18 +61,18 @@ class _TracingLock:
         self._lock.release()
 
     def wait(self) -> None:
-        """Wait until no other thread is tracing, even in an abandoned thread."""
+        """Wait until no other thread is tracing; abandoned threads may wait, too."""
         with self._lock:
             pass
 
 
 TRACING_LOCK = _TracingLock()
-"""Held while a model is traced, and never while a program is compiled or runs."""
+"""Lock held while a model is traced, but not while a program is compiled or runs."""
 
 
 @functools.cache
 def keep_compiled_programs() -> None:
-    """Keep compiled programs on the disk between sessions, unless JAX was told where, or not to.
+    """Store compiled programs on disk between sessions, unless JAX is configured otherwise.
 
     A compiled program is native code that the next session loads, so a folder to which others can
     write is not used.
@@ -90,7 +90,7 @@ def keep_compiled_programs() -> None:
 
 
 def compiled(function: Callable) -> Any:
-    """The function under `jax.jit`, with `COMPILER_OPTIONS` on a CPU."""
+    """Wrap a function in `jax.jit`, with `COMPILER_OPTIONS` on a CPU."""
     keep_compiled_programs()
     return jax.jit(
         function, compiler_options=COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
@@ -98,7 +98,7 @@ def compiled(function: Callable) -> Any:
 
 
 class JitOnce:
-    """A function that is traced under the lock, and compiled once for each shape and device.
+    """A function that is traced under the lock and compiled once per shape and device.
 
     The shape is that of the first argument; those of others must follow from it. With a key that
     no other function has, in any process, the next process loads the program from the disk.
@@ -111,7 +111,7 @@ class JitOnce:
 
     @property
     def is_begun(self) -> bool:
-        """Whether a compilation has begun."""
+        """True if a compilation has begun."""
         return bool(self._compilations)
 
     def __call__(self, *arguments: Any) -> Any:
@@ -119,12 +119,12 @@ class JitOnce:
         return self.program(*arguments)(*arguments)
 
     def begin(self, *arguments: object) -> None:
-        """Trace now, and compile on another thread; the arguments may be `ShapeDtypeStruct`."""
+        """Trace now and compile in another thread; arguments may be `ShapeDtypeStruct`."""
         if self._key(arguments) not in self._compilations:
             _COMPILER_THREAD.submit(self._trace(arguments).result)
 
     def program(self, *arguments: object) -> Callable:
-        """The compiled program for arguments of these shapes and types."""
+        """Return the compiled program for arguments of these shapes and types."""
         found = self._compilations.get(self._key(arguments))
         return (found or self._trace(arguments)).result()
 
@@ -185,7 +185,7 @@ class _Compilation:
 
 
 def bytes_of(program: Any) -> int:
-    """Memory that one run of a compiled program takes; 0 where the backend reports nothing."""
+    """Return the memory that a run of a program takes; 0 if the backend reports nothing."""
     analysis = program.memory_analysis()
     if analysis is None:
         return 0
@@ -194,7 +194,7 @@ def bytes_of(program: Any) -> int:
 
 
 def check_memory(needed: int) -> None:
-    """Refuse a program that does not fit into memory, before anything is allocated."""
+    """Refuse a program that does not fit into memory before anything is allocated."""
     limit = memory_limit()
     if limit is not None and needed > limit:
         raise FitError(
@@ -205,7 +205,7 @@ def check_memory(needed: int) -> None:
 
 
 def memory_limit() -> int | None:
-    """Bytes of the accelerator, or of the machine and its container; None where not known."""
+    """Return bytes of the accelerator, or of machine and container; None if unknown."""
     if jax.default_backend() != "cpu":
         return (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit")
     limits = []
@@ -222,19 +222,19 @@ def memory_limit() -> int | None:
 
 
 class LRUCache[T]:
-    """The values used last, by key; several threads may ask at once."""
+    """A thread-safe cache of the most recently used values."""
 
     def __init__(self, maxsize: int) -> None:
         self._values: cachetools.LRUCache[Hashable, T] = cachetools.LRUCache(maxsize)
         self._lock = threading.RLock()
 
     def get(self, key: Hashable) -> T | None:
-        """The value of a key, None if it is not in the cache."""
+        """Return the value of a key; None if it is not in the cache."""
         with self._lock:
             return self._values.get(key)
 
     def of(self, key: Hashable, make: Callable[[], T]) -> T:
-        """The value of a key, made now if it is not in the cache."""
+        """Return the value of a key, computed if it is not in the cache."""
         with self._lock:
             if key not in self._values:
                 self._values[key] = make()
@@ -249,7 +249,7 @@ class OutOfTimeError(Exception):
 
 
 def run_until[T](deadline: float, progress: Progress, work: Callable[[Progress], T]) -> T:
-    """Run work on a thread of its own, and abandon it at the deadline (`time.perf_counter`)."""
+    """Run work in another thread, and abandon it at the deadline (`time.perf_counter`)."""
     # An abandoned thread ends when it next reports progress or tries to trace a model. It traces
     # nothing after this function has returned or raised, so NumPyro's handlers are not shared.
     if deadline == float("inf"):
@@ -275,13 +275,13 @@ def run_until[T](deadline: float, progress: Progress, work: Callable[[Progress],
 
 
 _Reports = queue.SimpleQueue[tuple[str, float] | None]
-"""Progress of a thread; None when it has ended."""
+"""Progress reports of a thread; None marks its end."""
 
 
 def _start[T](
     work: Callable[[Progress], T], reports: _Reports, abandoned: threading.Event
 ) -> Future[T]:
-    """Run work on a new thread until it is abandoned."""
+    """Run work in a new thread until it is abandoned."""
     enable_x64 = jax.config.jax_enable_x64  # a thread does not inherit it
 
     def report(stage: str, fraction: float) -> None:

@@ -1,4 +1,4 @@
-"""What a program is compiled from: values, and the code of the user's functions that they use.
+"""Fingerprints of what a program is compiled from: values, and code of the user's functions.
 
 A function or class that is edited and loaded again keeps its name, by which it is pickled. Programs
 compiled from the old code must not serve the new one.
@@ -19,13 +19,13 @@ from numpyro.primitives import Messenger
 
 
 def fingerprint(*parts: object, code: Iterable[object]) -> str:
-    """A text that is equal for equal values whose functions have the same code."""
+    """Return a text that is equal for equal values whose functions have the same code."""
     # One by one: a token depends on which of the objects inside it are identical.
     return tokenize([tokenize(part) for part in (*map(_plain, parts), *_code_of(*code))])
 
 
 def uses_own_code(*roots: object) -> bool:
-    """Whether some function that the roots refer to is the user's own."""
+    """Return whether the roots refer to any function of the user's."""
     return any(isinstance(each, CodeType) for each in _code_of(*roots))
 
 
@@ -33,7 +33,7 @@ CONSTANTS = (str, bytes, int, float, complex, np.ndarray, np.generic, jax.Array)
 
 
 def _plain(value: object, above: tuple[object, ...] = ()) -> object:
-    """A value with the names of functions and classes in their place; it may hold itself."""
+    """Replace functions and classes in a value by their names; the value may contain itself."""
     # A token is made of a pickle that is read again. That of a class of a notebook would give the
     # class new methods, which no longer see what is edited there.
     if callable(value) and hasattr(value, "__qualname__"):
@@ -57,7 +57,7 @@ def _plain(value: object, above: tuple[object, ...] = ()) -> object:
 
 
 def _code_of(*roots: object) -> Iterator[object]:
-    """Byte code of the user's functions that the roots refer to, and the constants they read."""
+    """Return byte code of the user's functions below the roots, and the constants they read."""
     seen: dict[int, object] = {}  # holds the objects, so that no other one gets the same id
     pending = list(roots)
     while pending:
@@ -72,7 +72,7 @@ def _code_of(*roots: object) -> Iterator[object]:
 
 
 def _references(value: object) -> Iterable[object]:
-    """Objects whose code may run when a value is used."""
+    """Return objects whose code may run when a value is used."""
     if isinstance(value, ModuleType):
         return ()
     if isinstance(value, FunctionType):
@@ -88,7 +88,7 @@ def _references(value: object) -> Iterable[object]:
 
 
 def _globals_of(function: FunctionType) -> Iterator[object]:
-    """Values of the global names in a function, and of attributes of the user's own modules."""
+    """Return values of a function's global names, and attributes of the user's modules."""
     codes = [function.__code__]
     names: list[str] = []
     for code in codes:
@@ -102,7 +102,7 @@ def _globals_of(function: FunctionType) -> Iterator[object]:
 
 
 def _is_installed(module: str | None) -> bool:
-    """Whether a module is part of Python, of this package or of another installed one."""
+    """Return whether a module is part of Python, of this package or of an installed one."""
     package = (module or "").partition(".")[0]
     if package == "__main__":  # a notebook's cells, whichever installed program runs them
         return False

@@ -22,12 +22,12 @@ from polar_bayes.numerics.batches import AnyArray
 
 
 MAX_UNROLLED = 6
-"""Largest size of a matrix whose factor is written out, and most coordinates along which Jacobians
-are taken one by one. Beyond it compilation takes longer than the program saves."""
+"""Largest matrix whose factor is unrolled, and most coordinates along which Jacobians are computed
+one by one. Beyond it compilation takes longer than the program saves."""
 
 
 def cholesky(matrix: Float[Array | np.ndarray, "size size"]) -> Float[Array, "size size"]:
-    """Lower factor of a symmetric matrix; NaN where it is not positive definite."""
+    """Return the lower factor of a symmetric matrix; NaN if it is not positive definite."""
     size = matrix.shape[0]
     if size > MAX_UNROLLED:
         return jnp.linalg.cholesky(matrix)
@@ -42,7 +42,7 @@ def cholesky(matrix: Float[Array | np.ndarray, "size size"]) -> Float[Array, "si
 
 
 def inverse(factor: Float[Array, "size size"]) -> Float[Array, "size size"]:
-    """Inverse of a lower factor, lower again."""
+    """Return the inverse of a lower triangular factor, which is lower triangular."""
     size = factor.shape[0]
     if size > MAX_UNROLLED:
         unit = jnp.eye(size, dtype=factor.dtype)
@@ -57,7 +57,7 @@ def inverse(factor: Float[Array, "size size"]) -> Float[Array, "size size"]:
 
 
 def _root(x: Array) -> Array:
-    """Square root of what is above zero; NaN, not infinity one division later, of the rest."""
+    """Return the square root of positive numbers, and NaN rather than infinity for others."""
     return jnp.where(x > 0.0, jnp.sqrt(jnp.where(x > 0.0, x, 1.0)), jnp.nan)
 
 
@@ -70,7 +70,7 @@ def _lower(rows: list[list[Array]]) -> Array:
 
 
 class Derivatives(NamedTuple):
-    """The potential (minus the log posterior density) around a point."""
+    """Value, gradient and curvature of the potential, minus the log posterior density."""
 
     value: Float[AnyArray, ""]
     gradient: Float[AnyArray, " size"]
@@ -78,7 +78,7 @@ class Derivatives(NamedTuple):
 
 
 def derivatives(function: Callable, z: Float[Array, " size"]) -> Derivatives:
-    """Value, gradient and Hessian of a function of the unconstrained vector."""
+    """Return value, gradient and Hessian of a function of the unconstrained vector."""
 
     def first(z: Array) -> tuple[Array, tuple[Array, Array]]:
         value, gradient = jax.value_and_grad(function)(z)
@@ -108,7 +108,7 @@ class LMState(NamedTuple):
     steps: Int[AnyArray, ""]
     settled: Bool[AnyArray, ""]
     free: Float[AnyArray, " size"]
-    """One for each coordinate, zero for those that stay where they are."""
+    """One for each coordinate; zero for coordinates that are held."""
 
 
 class NormalApproximation(NamedTuple):
@@ -122,12 +122,12 @@ class NormalApproximation(NamedTuple):
 
     @property
     def log_evidence(self) -> np.ndarray:
-        """Of many pixels: that of the normal approximation, up to a constant, (pixel,)."""
+        """Log evidence of the normal approximation of many pixels, up to a constant, (pixel,)."""
         with np.errstate(invalid="ignore"):  # of pixels without a mode
             return np.log(np.diagonal(self.root, axis1=1, axis2=2)).sum(axis=1) - self.value
 
     def distance(self, z: Float[AnyArray, "pixel size"]) -> np.ndarray:
-        """Of many pixels: from the mode to a vector, in posterior sds, (pixel,); NaN if unknown."""
+        """Return distances of vectors from modes in posterior sds, (pixel,); NaN if unknown."""
         root, known = np.swapaxes(self.root, 1, 2), np.isfinite(self.root).all(axis=(1, 2))
         known &= (np.diagonal(root, axis1=1, axis2=2) > 0.0).all(axis=1)
         away = np.full(known.size, np.nan)
@@ -137,7 +137,7 @@ class NormalApproximation(NamedTuple):
 
 
 def init(z: Float[np.ndarray, "pixel size"]) -> LMState:
-    """States at the starts; the first step only evaluates the derivatives there."""
+    """Return states at the starts; the first step only evaluates the derivatives there."""
     count, size = z.shape
     unknown = np.full(count, np.inf, z.dtype)
     identity = np.broadcast_to(np.eye(size, dtype=z.dtype), (count, size, size))
@@ -153,7 +153,7 @@ def init(z: Float[np.ndarray, "pixel size"]) -> LMState:
 
 
 def step(derivatives_of: Callable[[Array], Derivatives], goal: float, state: LMState) -> LMState:
-    """One damped step, taken only where it decreases the potential."""
+    """Take one damped step if it decreases the potential."""
     value, gradient, curvature = state.derivatives
     free = state.free
     gradient = free * gradient
@@ -192,7 +192,7 @@ def step(derivatives_of: Callable[[Array], Derivatives], goal: float, state: LMS
 @jax.jit
 @jax.vmap
 def finalize(z: Float[Array, " size"], there: Derivatives) -> NormalApproximation:
-    """The last step, with exact curvature, and the normal approximation at its end."""
+    """Take the last step with the exact Hessian, and return the normal approximation."""
     value, gradient, curvature = there
     root = inverse(cholesky(curvature))
     whitened = root @ gradient

@@ -15,14 +15,14 @@ LARGEST_R_HAT, SMALLEST_ESS = 1.01, 400
 """Limits beyond which chains have not converged."""
 
 TAILS = (0.05, 0.95)
-"""Quantiles whose effective sample sizes are those of the tails."""
+"""Quantiles whose effective sample sizes are the tail ESS."""
 
 FALSE_ALARMS = 0.01
-"""How often some mean or standard deviation of one fit may be further off than expected."""
+"""Share of fits in which some mean or standard deviation may deviate more than expected."""
 
 
 class Mixing(NamedTuple):
-    """Of every coordinate."""
+    """R-hat and effective sample sizes, one row per coordinate."""
 
     bulk: Float[np.ndarray, " coordinate"]
     tail: Float[np.ndarray, " coordinate"]
@@ -30,7 +30,7 @@ class Mixing(NamedTuple):
 
 
 def measure(draws: Float[np.ndarray, "coordinate chain draw"]) -> Mixing:
-    """Effective sample sizes and R-hat, which monotone maps of a coordinate do not change."""
+    """Compute effective sample sizes and R-hat, which monotone maps do not change."""
     return Mixing(
         bulk=np.array([array_stats.ess(x, method="bulk") for x in draws]),
         tail=np.array([array_stats.ess(x, method="tail", prob=TAILS) for x in draws]),
@@ -41,7 +41,7 @@ def measure(draws: Float[np.ndarray, "coordinate chain draw"]) -> Mixing:
 def standard_errors(
     draws: Float[np.ndarray, "coordinate chain draw"],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Monte Carlo standard errors of mean and standard deviation, in standard deviations."""
+    """Return Monte Carlo standard errors of mean and sd, in posterior sds."""
     sd = draws.reshape(len(draws), -1).std(axis=-1)
     with np.errstate(all="ignore"):
         return (
@@ -53,7 +53,7 @@ def standard_errors(
 def weighted_standard_errors(
     draws: Float[np.ndarray, "coordinate draw"], weights: Float[np.ndarray, " draw"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same of self-normalized weighted draws."""
+    """Return Monte Carlo standard errors of self-normalized weighted draws."""
     # Source: Owen (2013), Monte Carlo theory, methods and examples, section 9.2: the delta method.
     apart = draws - (draws @ weights)[:, None]
     variance = apart**2 @ weights
@@ -64,7 +64,7 @@ def weighted_standard_errors(
 
 
 def largest_error(mean: np.ndarray, sd: np.ndarray) -> float:
-    """Error of a mean or standard deviation that 1% of the fits exceed, from standard errors."""
+    """Return the error of a mean or sd that 1% of fits exceed, from standard errors."""
     # Each of the 2P standard errors times the normal quantile of 0.5% / (2P) (Bonferroni). Bias
     # is not seen here.
     errors = np.concatenate([mean, sd])
@@ -74,10 +74,10 @@ def largest_error(mean: np.ndarray, sd: np.ndarray) -> float:
 
 
 def quantile(count: int) -> float:
-    """Standard errors within which so many numbers stay together, but in 1% of the fits."""
+    """Return the number of standard errors that 99% of the largest of so many errors stay below."""
     return float(scipy.stats.norm.isf(0.5 * FALSE_ALARMS / count))
 
 
 def draws_needed(tolerance: float, count: int) -> int:
-    """Independent draws after which the largest error is below a tolerance, parameters normal."""
+    """Return independent draws that reach a tolerance, for normal parameters."""
     return int(np.ceil((quantile(2 * count) / tolerance) ** 2))

@@ -29,39 +29,39 @@ from scipy.stats import qmc
 
 
 PROPOSAL_DEGREES_OF_FREEDOM = 6.0
-"""Of the Student t proposal: few enough for longer tails than those of a posterior, many enough to
-spend few draws on them."""
+"""Degrees of freedom of the Student t proposal: few enough for longer tails than those of a
+posterior, many enough to spend few draws on them."""
 
 
 class Points(NamedTuple):
-    """Quasi-random draws of a standard distribution, the same for all pixels."""
+    """Quasi-random draws of a standard distribution, which all pixels share."""
 
     z: Float[np.ndarray, "draw size"]
     log_density: Float[np.ndarray, " draw"]
 
     def split(self, count: int) -> list["Points"]:
-        """The same in parts of one size."""
+        """Split the points into parts of one size."""
         parts = (np.split(array, count) for array in self)
         return [Points(*part) for part in zip(*parts, strict=True)]
 
 
 class Proposal(NamedTuple):
-    """A distribution in every pixel: its draws are `center + points.z @ root`."""
+    """A proposal distribution for every pixel; its draws are `center + points.z @ root`."""
 
     center: Float[np.ndarray, "pixel size"]
     root: Float[np.ndarray, "pixel size size"]
 
     def rotated(self, rotations: Float[np.ndarray, "pixel size size"]) -> "Proposal":
-        """The same distribution, whose points are first rotated, in each pixel differently."""
+        """Return the distribution with its points rotated differently in each pixel."""
         return Proposal(self.center, rotations @ self.root)
 
     def draws(self, points: Points) -> Float[np.ndarray, "pixel draw size"]:
-        """Unconstrained vectors of all draws."""
+        """Return unconstrained vectors of all draws."""
         return self.center[:, None] + points.z @ self.root
 
 
 def normal_points(count: int, size: int, seed: int) -> Points:
-    """Quasi-random points of the standard normal distribution."""
+    """Return quasi-random points of the standard normal distribution."""
     # Their radii are quantiles of the chi distribution, one of each, so that over all rotations of
     # the points every quantile in every direction is right.
     points = scipy.special.ndtri(_sobol(-(-count // 2), size, seed))
@@ -73,7 +73,7 @@ def normal_points(count: int, size: int, seed: int) -> Points:
 
 
 def student_t_points(count: int, size: int, seed: int) -> Points:
-    """Quasi-random points of a standard multivariate Student t distribution."""
+    """Return quasi-random points of a standard multivariate Student t distribution."""
     freedom = PROPOSAL_DEGREES_OF_FREEDOM
     share = _sobol(-(-count // 2), size + 1, seed)
     chi_squared = 2.0 * scipy.special.gammaincinv(0.5 * freedom, share[:, :1])
@@ -83,18 +83,18 @@ def student_t_points(count: int, size: int, seed: int) -> Points:
 
 
 def _sobol(count: int, size: int, seed: int) -> Float[np.ndarray, "count size"]:
-    """Scrambled Sobol' points (Owen 1998, J. Complexity 14(4), 466-489), inside of (0, 1)."""
+    """Return scrambled Sobol' points in (0, 1) (Owen 1998, J. Complexity 14(4), 466-489)."""
     points = qmc.Sobol(size, rng=np.random.default_rng(seed)).random(count)
     return np.clip(points, 1e-12, 1.0 - 1e-12)
 
 
 def _antithetic(points: Float[np.ndarray, "half size"]) -> Float[np.ndarray, "count size"]:
-    """Each point followed by its mirror image."""
+    """Pair each point with its mirror image."""
     return np.stack([points, -points], axis=1).reshape(-1, points.shape[1])
 
 
 def random_rotations(keys: np.ndarray, size: int) -> Float[np.ndarray, "pixel size size"]:
-    """A random rotation or reflection for each pixel (Mezzadri 2007, Notices of the AMS 54(5))."""
+    """Draw a random rotation or reflection per pixel (Mezzadri 2007, Notices AMS 54(5))."""
     # Otherwise the error of a few points in a quantile would be the same in all pixels.
     # Integers are the same however a program was compiled, and for however many pixels.
     share = (np.asarray(_random_integers(keys, size)) + 0.5) / 2.0**32
@@ -112,7 +112,7 @@ def _random_integers(keys: Array, size: int) -> Array:
 def fit_t(
     draws: Float[np.ndarray, "pixel draw size"], weights: Float[np.ndarray, "pixel draw"]
 ) -> Proposal:
-    """A proposal with the mean and covariance of weighted draws."""
+    """Return a proposal with the mean and covariance of weighted draws."""
     center = np.einsum("pd,pds->ps", weights, draws)
     centered = draws - center[:, None]
     covariance = np.einsum("pd,pds,pdt->pst", weights, centered, centered)
@@ -129,17 +129,18 @@ def fit_t(
 
 
 DEGREES_OF_FREEDOM = 8.0
-"""Of each component: longer tails than those of most posteriors bound the weights."""
+"""Degrees of freedom of each component: longer tails than most posteriors' bound the weights."""
 
 EM_STEPS = 15
-"""Of expectation maximization; the mixture need not be the best one, only a good one."""
+"""Steps of expectation maximization; the mixture need not be optimal."""
 
 WIDE_SHARE, WIDE_SCALE = 0.15, 2.0
-"""Of one more component around all draws: it reaches tails that the draws represent too little."""
+"""Weight and scale of an additional component around all draws, which covers tails that the draws
+represent too little."""
 
 
 class Mixture(NamedTuple):
-    """A mixture in coordinates in which all draws together have mean 0 and covariance 1."""
+    """A mixture in coordinates in which all draws have mean 0 and covariance 1."""
 
     center: Float[Array, " size"]
     half: Float[Array, "size size"]
@@ -151,7 +152,7 @@ class Mixture(NamedTuple):
 def moments(
     z: Float[Array, "draw size"], weights: Float[Array, " draw"]
 ) -> tuple[Float[Array, " size"], Float[Array, "size size"]]:
-    """Mean of weighted draws, and the lower Cholesky factor of their covariance."""
+    """Return the mean of weighted draws, and the lower Cholesky factor of their covariance."""
     center = weights @ z
     centered = z - center
     sd = jnp.sqrt(weights @ centered**2)
@@ -163,7 +164,7 @@ def moments(
 
 
 def resample(weights: Float[Array, " draw"], count: int, key: Array) -> Array:
-    """Indices of `count` draws by systematic resampling."""
+    """Return indices of `count` draws by systematic resampling."""
     even = (jnp.arange(count) + jax.random.uniform(key)) / count
     return jnp.clip(jnp.searchsorted(jnp.cumsum(weights), even), 0, len(weights) - 1)
 
@@ -171,7 +172,7 @@ def resample(weights: Float[Array, " draw"], count: int, key: Array) -> Array:
 def fit_mixture(
     z: Float[Array, "draw size"], weights: Float[Array, " draw"], components: int, key: Array
 ) -> Mixture:
-    """Fit normal components by expectation maximization, shrunk towards all draws together."""
+    """Fit normal components by EM, with covariances shrunk towards that of all draws."""
     size = z.shape[-1]
     center, half = moments(z, weights)
     x = (z - center) @ _inverse(half).T
@@ -208,7 +209,7 @@ def fit_mixture(
 
 
 def draw_mixture(mixture: Mixture, count: int, key: Array) -> Float[Array, "draw size"]:
-    """Draws of the mixture, its components chosen by systematic resampling."""
+    """Draw from the mixture, with components chosen by systematic resampling."""
     key_which, key_normal, key_tail = jax.random.split(key, 3)
     which = resample(jnp.exp(mixture.log_share), count, key_which)
     dtype, freedom = mixture.mean.dtype, DEGREES_OF_FREEDOM
@@ -219,7 +220,7 @@ def draw_mixture(mixture: Mixture, count: int, key: Array) -> Float[Array, "draw
 
 
 def log_density(mixture: Mixture, z: Float[Array, "draw size"]) -> Float[Array, " draw"]:
-    """Log density of the mixture, up to a constant that all mixtures share."""
+    """Return the log density of the mixture, up to a constant common to all mixtures."""
     freedom, size = DEGREES_OF_FREEDOM, z.shape[-1]
     x = (z - mixture.center) @ _inverse(mixture.half).T
     squares, log_volume = _whitened(x, mixture.mean, mixture.scale)
@@ -229,7 +230,7 @@ def log_density(mixture: Mixture, z: Float[Array, "draw size"]) -> Float[Array, 
 
 
 def _whitened(x: Array, mean: Array, scale: Array) -> tuple[Array, Array]:
-    """Squared distances of draws from components, (draw, component), and log volumes of these."""
+    """Return squared distances (draw, component) from components, and their log volumes."""
 
     def squares(mean: Array, scale: Array) -> Array:
         return jnp.sum(((x - mean) @ _inverse(scale).T) ** 2, axis=-1)
@@ -239,5 +240,5 @@ def _whitened(x: Array, mean: Array, scale: Array) -> tuple[Array, Array]:
 
 
 def _inverse(scale: Array) -> Array:
-    """Of a small triangle: with many right-hand sides, a library would share them among cores."""
+    """Invert a small triangular matrix without a library call that is split among cores."""
     return solve_triangular(scale, jnp.eye(len(scale), dtype=scale.dtype), lower=True)

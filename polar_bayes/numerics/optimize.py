@@ -28,14 +28,14 @@ from polar_bayes.progress import Progress
 ValueAndGradient = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
 SAME_MODE = 0.1
-"""Two searches that end within so many posterior standard deviations found the same mode."""
+"""Largest distance, in posterior sds, between ends of two searches that found the same mode."""
 
 STEP = 1e-3
-"""Step of central differences of a potential, in posterior standard deviations: the error of a
-gradient is 1e-10 by rounding, and a third derivative by 2e-7."""
+"""Step of central differences of a potential, in posterior sds: a gradient has a rounding error of
+1e-10, and an error of 2e-7 by a third derivative."""
 
 SETTLED = 1e-2
-"""Largest Newton decrement, in posterior standard deviations, of a search that has converged."""
+"""Largest Newton decrement, in posterior sds, of a search that has converged."""
 
 
 class ModeStatus(enum.IntEnum):
@@ -47,7 +47,7 @@ class ModeStatus(enum.IntEnum):
 
 
 class Optimum(NamedTuple):
-    """The end of one search."""
+    """The end point of one search."""
 
     z: np.ndarray
     potential: float
@@ -57,11 +57,11 @@ class Optimum(NamedTuple):
 
     @property
     def log_evidence(self) -> float:
-        """Laplace's approximation, up to a constant of the dimension; NaN without a covariance."""
+        """Laplace's approximation, up to a constant; NaN without a covariance."""
         return -self.potential + 0.5 * np.linalg.slogdet(self.covariance)[1]
 
     def distance(self, z: np.ndarray) -> float:
-        """Mahalanobis distance of a vector."""
+        """Return the Mahalanobis distance of a vector from the mode."""
         return float(np.sqrt((z - self.z) @ np.linalg.solve(self.covariance, z - self.z)))
 
 
@@ -100,7 +100,7 @@ class NumpyPotential[Given]:
 
 
 class DifferencedPotential[Given]:
-    """The same in double precision, of which only values are compiled: gradients are differences.
+    """A potential in double precision with gradients by differences: only values are compiled.
 
     That compiles three times as fast as the gradient, and runs half as fast: for a few searches.
     """
@@ -119,7 +119,7 @@ class DifferencedPotential[Given]:
         return float(value), (above - below) / (2.0 * self._step)
 
     def parameters(self, z: np.ndarray) -> dict[str, np.ndarray]:
-        """The parameters of a vector."""
+        """Return the parameters at a vector."""
         return {name: np.asarray(rows)[0] for name, rows in self._evaluate(z)[1].items()}
 
     def _evaluate(self, z: np.ndarray) -> tuple[np.ndarray, Mapping[str, Array]]:
@@ -130,7 +130,7 @@ class DifferencedPotential[Given]:
 
 
 def finite_potential(potential: ValueAndGradient) -> ValueAndGradient:
-    """The potential with a flat wall where it, or its gradient, is not finite."""
+    """Replace values and gradients of the potential that are not finite by a flat wall."""
 
     def guarded(z: np.ndarray) -> tuple[float, np.ndarray]:
         value, gradient = potential(z)
@@ -147,7 +147,7 @@ def central_difference_hessian(
     dtype: DTypeLike,
     rows: Sequence[int] | np.ndarray | None = None,
 ) -> np.ndarray:
-    """Rows of the Hessian, all by default, by central differences of the gradient."""
+    """Return rows of the Hessian, all by default, by central differences of the gradient."""
     # With these steps truncation and rounding both stay below 1e-7 of the Hessian (double
     # precision).
     found, steps = [], _steps(sd, dtype)
@@ -161,18 +161,18 @@ def central_difference_hessian(
 def forward_difference_hessian(
     potential: ValueAndGradient, z: np.ndarray, sd: np.ndarray, dtype: DTypeLike
 ) -> np.ndarray:
-    """The Hessian for half the gradients, to 1e-4 of it: enough for a proposal, not for a mode."""
+    """Return the Hessian by forward differences, to 1e-4: for proposals, not for modes."""
     steps, at_z = _steps(sd, dtype), potential(z)[1]
     return np.stack([(potential(z + s)[1] - at_z) / s.max() for s in np.diag(steps)])
 
 
 def _steps(sd: np.ndarray, dtype: DTypeLike) -> np.ndarray:
-    """The fourth root of the rounding error, in units of the posterior's own sds."""
+    """Return steps: the fourth root of the rounding error, in the posterior's own sds."""
     return np.clip(sd, 1e-6, 1.0) * np.finfo(dtype).eps ** 0.25
 
 
 def symmetrize(matrix: np.ndarray) -> np.ndarray:
-    """The symmetric part of a square matrix."""
+    """Return the symmetric part of a square matrix."""
     return 0.5 * (matrix + matrix.T)
 
 
@@ -212,7 +212,7 @@ def find_mode(
 def conditional_normal(
     covariance: Float[np.ndarray, "size size"], index: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Regression of all coordinates on one, and a factor of the covariance that it leaves."""
+    """Return the regression of all coordinates on one, and a conditional covariance factor."""
     # The factor has a row of zeros for the one, and a column of zeros where there is no other.
     size = len(covariance)
     slope = covariance[:, index] / covariance[index, index]
@@ -227,7 +227,7 @@ def conditional_normal(
 def conditional_mode(
     potential: ValueAndGradient, start: np.ndarray, factor: np.ndarray, **options: float
 ) -> tuple[np.ndarray, float]:
-    """Where a finite potential is least along the columns of a factor, by BFGS; its value there."""
+    """Minimize a finite potential along a factor's columns by BFGS; return point and value."""
 
     def along(y: np.ndarray) -> tuple[float, np.ndarray]:
         value, gradient = potential(start + factor @ y)
@@ -239,7 +239,7 @@ def conditional_mode(
 
 
 def distinct_modes(ends: list[Optimum]) -> Modes | None:
-    """One end for each mode; where no search converged, those within one sd of a mode."""
+    """Return one end per mode; if no search converged, all ends within one sd of a mode."""
     near = [end for end in ends if end.decrement < 1.0]
     converged = [end for end in near if end.status is ModeStatus.OK]
     modes: list[Optimum] = []
@@ -265,7 +265,7 @@ def find_modes(
     progress: Progress,
     guess: np.ndarray | None = None,
 ) -> Modes:
-    """The distinct modes that searches from all starts reach, with a guess of the covariance."""
+    """Return distinct modes from searches of all starts, given a guess of the covariance."""
     ends = []
     with ignore_line_search_warnings():
         for number, start in enumerate(starts):
@@ -282,7 +282,7 @@ def find_modes(
 
 
 class _WarningFilter:
-    """One filter for all threads: the first search sets it, the last one resets it."""
+    """A warning filter for all threads: set by the first search and reset by the last."""
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
@@ -312,5 +312,5 @@ def ignore_line_search_warnings() -> Iterator[None]:
 
 
 def finite_sd(draws: np.ndarray) -> np.ndarray:
-    """Standard deviations of coordinates, (draw, size), without those at a bound of a support."""
+    """Return sds of coordinates, (draw, size), without draws at a bound of a support."""
     return np.std(draws, axis=0, dtype=float, where=np.isfinite(draws))

@@ -19,22 +19,22 @@ from jaxtyping import Array, Float
 from polar_bayes.numerics.batches import AnyArray
 
 MAX_PARETO_K = 0.7
-"""Pareto k above which weighted draws say little, however many there are."""
+"""Largest Pareto k of reliable weighted draws, however many there are."""
 
 FINITE_VARIANCE = 0.5
-"""Pareto k up to which weights have a variance. Between it and 0.7 an arm of a posterior was missed
+"""Largest Pareto k of weights with a variance. Between it and 0.7 a tail of a posterior was missed
 in 3 of 3 seeds."""
 
 
 class Smoothed(NamedTuple):
-    """Weights of the draws of every pixel."""
+    """Smoothed weights of the draws of every pixel, and Pareto k."""
 
     weights: Float[np.ndarray, "pixel draw"]
     pareto_k: Float[np.ndarray, " pixel"]
 
 
 def smooth(log_ratios: Float[np.ndarray, "pixel draw"], relative_ess: float = 1.0) -> Smoothed:
-    """Pareto-smoothed importance weights of many pixels at once.
+    """Return Pareto-smoothed importance weights of many pixels.
 
     `relative_ess` is the effective over the actual number of draws: that of chains is not one.
     """
@@ -66,7 +66,7 @@ def smooth(log_ratios: Float[np.ndarray, "pixel draw"], relative_ess: float = 1.
 
 
 def _fit_tail(excess: Float[np.ndarray, "pixel tail"]) -> tuple[np.ndarray, np.ndarray]:
-    """Shape and scale of generalized Pareto distributions, ascending excesses in every row."""
+    """Fit generalized Pareto distributions to ascending excesses, row by row."""
     # Source: Zhang & Stephens (2009), Technometrics 51(3), 316-325, with the prior of Vehtari et
     # al.
     count = excess.shape[-1]
@@ -89,7 +89,7 @@ def _fit_tail(excess: Float[np.ndarray, "pixel tail"]) -> tuple[np.ndarray, np.n
 
 
 def _quantiles(steps: np.ndarray, shape: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Of a generalized Pareto distribution."""
+    """Return quantiles of a generalized Pareto distribution."""
     spread = np.where(shape == 0.0, -np.log1p(-steps), np.expm1(-shape * np.log1p(-steps)) / shape)
     return scale * spread
 
@@ -101,7 +101,7 @@ def summarize(
     *,
     random: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean, standard deviation and quantiles of weighted draws; quasi-random unless `random`."""
+    """Return mean, sd and quantiles of weighted draws; quasi-random unless `random`."""
     # Draws without weight may be as far out as infinity, and zero times infinity is NaN.
     low = np.min(draws, axis=-1, keepdims=True, where=weights > 0.0, initial=np.inf)
     high = np.max(draws, axis=-1, keepdims=True, where=weights > 0.0, initial=-np.inf)
@@ -122,7 +122,7 @@ def summarize(
 
 
 def _interpolate(level: float, below: np.ndarray, ranked: np.ndarray) -> np.ndarray:
-    """One quantile of every row."""
+    """Interpolate one quantile of every row."""
     last = ranked.shape[-1] - 1
     right = np.clip(np.sum(below < level, axis=-1), 1, last)[:, None]
     x0, x1 = (np.take_along_axis(ranked, at, axis=-1)[:, 0] for at in (right - 1, right))
@@ -133,7 +133,7 @@ def _interpolate(level: float, below: np.ndarray, ranked: np.ndarray) -> np.ndar
 
 
 def weighted_ess(weights: Float[np.ndarray, "pixel draw"]) -> Float[np.ndarray, " pixel"]:
-    """Effective sample size of weighted draws (Kish), as a number of independent draws."""
+    """Return the effective sample size of weighted draws (Kish)."""
     return 1.0 / np.sum(weights**2, axis=-1)
 
 
@@ -141,16 +141,16 @@ def weighted_ess(weights: Float[np.ndarray, "pixel draw"]) -> Float[np.ndarray, 
 
 
 CHAINS = 4
-"""Groups of resampled draws, for diagnostics that ask for chains."""
+"""Number of groups of resampled draws, for diagnostics that require chains."""
 
 FEWEST, MOST = 50, 10_000
-"""Resampled draws of each group."""
+"""Fewest and most resampled draws of each group."""
 
 
 def systematic_resample(
     weights: Float[np.ndarray, " draw"], effective: float, random: np.random.Generator
 ) -> Float[np.ndarray, "chain draw"]:
-    """Indices of draws, each as often as it weighs, in random order."""
+    """Return indices of draws resampled by weight, in random order."""
     # As many are drawn as the effective sample size: more would look like more than is known.
     # Source: Kitagawa (1996), J. Comput. Graph. Stat. 5(1), 1-25.
     each = int(np.clip(effective / CHAINS, FEWEST, MOST))
@@ -162,18 +162,18 @@ def systematic_resample(
 def draws_at(
     levels: Float[np.ndarray, " level"], weights: Float[np.ndarray, " draw"]
 ) -> Float[np.ndarray, " level"]:
-    """Indices of the draws at which the summed weights reach each level."""
+    """Return indices of the draws at which the cumulative weight reaches each level."""
     return np.clip(np.searchsorted(np.cumsum(weights), levels), 0, len(weights) - 1)
 
 
 def max_effective_size(count: int) -> float:
-    """Effective sample size after resampling so many draws of equal weight."""
+    """Return the largest effective sample size after resampling so many draws."""
     resampled = min(count, CHAINS * MOST)
     return count * resampled / (count + resampled) if count else 0.0
 
 
 def numpy_generator(key: Array) -> np.random.Generator:
-    """NumPy's random numbers from a key of JAX."""
+    """Return a NumPy random generator seeded by a key of JAX."""
     return np.random.default_rng(np.asarray(jax.random.key_data(key)))
 
 
@@ -184,7 +184,7 @@ LEVELS = (0.025, 0.1, 0.25, 0.5, 0.75, 0.9, 0.975)
 
 
 class Marginals:
-    """Marginals of a batch of pixels, filled in as answers come: NaN where a pixel has none.
+    """Marginals of a batch of pixels; NaN for pixels without an answer.
 
     `scores` are functions of draws, each (pixel, draw), for which the slopes of means are kept.
     """

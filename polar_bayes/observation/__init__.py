@@ -1,4 +1,4 @@
-"""From predicted to recorded: data as arrays, noise schedules, likelihood links."""
+"""Observation: captures as arrays, noise schedules and likelihood links."""
 
 from polar_bayes.namespace import attach
 

@@ -58,7 +58,7 @@ class Observations(eqx.Module):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Length of every axis, outermost first."""
+        """Lengths of all axes, outermost first."""
         return tuple(length for _, length in self.dims)
 
     @property
@@ -72,12 +72,12 @@ class Observations(eqx.Module):
         return slice(None if self.views is None else int(self.views))
 
     def in_single_precision(self) -> "Observations":
-        """The same readings as 32-bit numbers; masks stay masks."""
+        """Return the readings as 32-bit numbers; masks are unchanged."""
         return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, self)
 
 
 def padded_length(views: int) -> int:
-    """The number of views that programs are compiled for: 8, 12, 16, 24, 32, 48, 64, ..."""
+    """Return the number of views to compile for: 8, 12, 16, 24, 32, 48, 64, ..."""
     power = max(8, 1 << (views - 1).bit_length())
     between = 3 * power // 4
     return between if 8 < between and views <= between else power
@@ -90,7 +90,7 @@ def observe(
     intensity_unit: float | None = None,
     padded: bool = False,
 ) -> Observations:
-    """Turn a validated capture into the arrays of a model, padded to `padded_length` if asked."""
+    """Convert a validated capture to arrays, padded to `padded_length` on request."""
     views = capture.sizes["view"]
     if padded:  # by the last view again, whose directions are possible ones
         capture = capture.isel(view=np.minimum(np.arange(padded_length(views)), views - 1))
@@ -150,7 +150,7 @@ def _axis_order(reading: xr.DataArray) -> tuple[str, ...]:
 def _values(
     capture: xr.Dataset, name: str, order: tuple[str, ...], default: bool | None = None
 ) -> np.ndarray:
-    """One variable with the axes of `order`, of length 1 where it does not have them."""
+    """Return one variable with the axes of `order`; missing axes have length 1."""
     if name not in capture and default is not None:
         return np.full((1,) * len(order), default)
     variable = capture[name]
@@ -162,7 +162,7 @@ def _values(
 def _intensity_range(
     capture: xr.Dataset, order: tuple[str, ...], measured: np.ndarray, unit: float | None
 ) -> tuple[float, float]:
-    """The unit of intensity (largest reading or saturation level) and the full scale."""
+    """Return the unit of intensity (saturation level or largest reading) and full scale."""
     if "intensity" not in capture:
         return 1.0, np.inf
     level = capture["intensity"].attrs.get("saturation_level")

@@ -1,4 +1,4 @@
-"""Two distributions that stay accurate where the textbook forms lose digits.
+"""Distributions that remain accurate where textbook formulas lose digits.
 
 `MeanConcentrationBeta` is the Beta distribution by mean and concentration; its log density is
 written as a divergence plus Stirling remainders, so that concentrations of 1e8 cancel nothing.
@@ -20,7 +20,8 @@ from numpyro.distributions import constraints
 from numpyro.distributions.util import promote_shapes
 
 TAIL_NODES, TAIL_POWERS = 24, 20
-"""Of the tail of Student's t: enough for the last digit of double precision."""
+"""Numbers of nodes and powers for the tail of Student's t, to the last digit of double
+precision."""
 
 
 class MeanConcentrationBeta(dist.Distribution):
@@ -86,7 +87,7 @@ class MeanConcentrationBeta(dist.Distribution):
         return jnp.where(is_low | is_high, density + self._log_width(is_high), density)
 
     def _log_width(self, is_high: Array) -> Array:
-        """Log of the probability within the margin over the density at its end."""
+        """Return the log of the probability within the margin over the density at its end."""
         mean, other = self.mean_value, 1.0 - self.mean_value
         near = jnp.where(is_high, other, mean) * self.concentration
         far = jnp.where(is_high, mean, other) * self.concentration
@@ -125,7 +126,7 @@ class MeanConcentrationBeta(dist.Distribution):
 
 @functools.cache
 def _laguerre(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights of integrals from zero to infinity with a weight of exp(-u)."""
+    """Return nodes and weights of integrals from zero to infinity with weight exp(-u)."""
     return np.polynomial.laguerre.laggauss(count)
 
 
@@ -181,19 +182,19 @@ class SensorStudentT(dist.Distribution):
     @property
     @override
     def mean(self) -> Array:
-        """The noise-free reading, within the limits of the sensor."""
+        """The noise-free reading, clipped to the limits of the sensor."""
         return jnp.clip(self.location, 0.0, self.full_scale)
 
     @property
     @override
     def variance(self) -> Array:
-        """That of the noise, as if the sensor had no limits."""
+        """Variance of the noise, as if the sensor had no limits."""
         freedom = self.degrees_of_freedom
         return self.scale**2 * (freedom / (freedom - 2.0) if freedom > 2.0 else math.inf)
 
 
 def log_density(distance: Float[Array, "..."], degrees_of_freedom: float) -> Float[Array, "..."]:
-    """Log density of Student's t, in the precision of `distance`."""
+    """Return the log density of Student's t, in the precision of `distance`."""
     half = 0.5 * (degrees_of_freedom + 1.0)
     constant = math.lgamma(half) - math.lgamma(0.5 * degrees_of_freedom)
     constant -= 0.5 * math.log(math.pi * degrees_of_freedom)
@@ -202,7 +203,7 @@ def log_density(distance: Float[Array, "..."], degrees_of_freedom: float) -> Flo
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def log_survival(distance: Float[Array, "..."], degrees_of_freedom: float) -> Float[Array, "..."]:
-    """Log probability that Student's t exceeds `distance`, finite far into the tail."""
+    """Return the log probability above `distance`, finite far into the tail."""
     dtype = jnp.result_type(float, distance)
     # With tan(angle) = sqrt(nu) / |t| the tail is an integral of sin(phi) ** (nu - 1) over phi up
     # to the angle: half ** nu, with half = tan(angle / 2), times something so smooth in half ** 2
@@ -226,7 +227,7 @@ def _log_survival_derivative(degrees_of_freedom, primals, tangents):
 
 @functools.cache
 def _tail_series(degrees_of_freedom: float) -> tuple[float, ...]:
-    """The log of the tail over half ** nu, in powers of 2 half ** 2 - 1, highest first."""
+    """Return the log of tail / half ** nu, as a series in 2 half ** 2 - 1, highest power first."""
     power = degrees_of_freedom - 1.0
     nodes, weights = scipy.special.roots_jacobi(TAIL_NODES, 0.0, power)
     scale = 2.0**degrees_of_freedom * scipy.special.beta(0.5 * degrees_of_freedom, 0.5)
@@ -245,7 +246,7 @@ def _tail_series(degrees_of_freedom: float) -> tuple[float, ...]:
 def _excess(
     mean: Float[Array, "..."], value: Float[Array, "..."], step: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """`step - mean log(value / mean)`, one half of the divergence, for `step = value - mean`."""
+    """Return `step - mean log(value / mean)`, half the divergence, for `step = value - mean`."""
     # The first-order terms cancel near the mean, hence the series; far from it the logarithm takes
     # the quotient itself, since `1 + step / mean` has lost its digits where that is nearly 0.
     # log(value / mean) = 2 artanh(slant), an odd series whose first term is known.
@@ -278,7 +279,7 @@ def _stirling_remainder(z: Float[Array, "..."]) -> tuple[Array, Array]:
 
 
 def _stirling_series(z: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The remainder for z > 8: Bernoulli numbers over 2k(2k-1); the next term is below 2e-15."""
+    """Return the remainder for z > 8: Bernoulli numbers over 2k(2k-1), to 2e-15."""
     inverse = 1.0 / z
     square = inverse * inverse
     coefficients = (1 / 12, -1 / 360, 1 / 1260, -1 / 1680, 1 / 1188, -691 / 360360, 1 / 156)

@@ -45,12 +45,12 @@ PerView = Float[Array, "... view"]
 
 
 SMOOTHING = 0.5
-"""Width of the bend at the least headroom, in units of the least headroom."""
+"""Width of the smooth bend at the least headroom, in units of the least headroom."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ConcentrationSchedule(HTMLRepr):
-    r"""Concentration of the degree of polarization: bright, upright views are sharper.
+    r"""Concentration of the degree of polarization, higher for bright, upright views.
 
     $$ \kappa = \kappa_{\min} + \kappa_{scale} (I/I_{\max})^\eta \cos(\theta_v)^\gamma $$
 
@@ -76,14 +76,14 @@ class ConcentrationSchedule(HTMLRepr):
         _check_range(self, "angle_exponent", 0.0, 2.0)
 
     def concentration(self, scale: Array, brightness: PerView, cos_view: PerView) -> PerView:
-        """The concentration of each view, at least `minimum`; brightness is the recorded one."""
+        """Return each view's concentration, at least `minimum`, from recorded brightness."""
         gain = brightness**self.brightness_exponent * cos_view**self.angle_exponent
         return self.minimum + scale * gain
 
 
 @dataclasses.dataclass(frozen=True)
 class ScaleSchedule(HTMLRepr):
-    r"""Scale of the intensity noise: it grows towards full scale and towards grazing.
+    r"""Scale of the intensity noise, which grows towards full scale and towards grazing.
 
     $$ \sigma = \sigma_0 (1 - I/I_{\max})^{-\delta} \cos(\theta_v)^{-\zeta} $$
 
@@ -113,7 +113,7 @@ class ScaleSchedule(HTMLRepr):
         _check_range(self, "least_cosine", 1e-6, 1.0)
 
     def scale(self, base: Array, brightness: PerView, cos_view: PerView) -> PerView:
-        """The scale of each view, at least `base`; brightness is the predicted one."""
+        """Return each view's scale, at least `base`, from predicted brightness."""
         # A smooth bound: a corner here would put a corner, not a peak, on top of the posterior
         # whenever a view is predicted close to full scale.
         width = SMOOTHING * self.least_headroom
@@ -126,17 +126,17 @@ class ScaleSchedule(HTMLRepr):
 
 
 def precision_by_confidence(precision: Array, confidence: PerView | None) -> Array:
-    """A precision, times the confidence in the stated normal."""
+    """Multiply a precision by the confidence in the stated normal."""
     return precision if confidence is None else precision * confidence
 
 
 def scale_by_confidence(scale: Array, confidence: PerView | None) -> Array:
-    """A scale of noise, over the square root of the confidence in the stated normal."""
+    """Divide a noise scale by the square root of the confidence in the stated normal."""
     return scale if confidence is None else scale / jnp.sqrt(confidence)
 
 
 def stated_errors(link: object, name: str, data: Observations) -> PerView:
-    """The errors that a capture states of a reading, refused where it states none."""
+    """Return the errors that a capture states for a variable; refuse a capture without them."""
     if name not in data.errors:
         what = f"the capture states no {name}_error"
         hint = "add that variable to the capture or use stated_errors=False"
@@ -165,18 +165,18 @@ class AbstractLink(HTMLRepr, abc.ABC):
     observables: ClassVar[tuple[str, ...]]
     """The capture's variables that this link can describe."""
     parameters: ClassVar[tuple[str, ...]] = ()
-    """The noise parameters that it reads, each sampled from its prior."""
+    """Noise parameters that the link reads, each of which is sampled from its prior."""
 
     @property
     def reads_errors(self) -> bool:
-        """True where it needs the standard errors that a capture states of its readings."""
+        """True if the link needs the standard errors that a capture states."""
         return False
 
     @abc.abstractmethod
     def distribution(
         self, name: str, prediction: Prediction, data: Observations, noise: Noise
     ) -> dist.Distribution:
-        """The distribution of the reading `name`.
+        """Return the distribution of the reading `name`.
 
         Args:
             name: The capture's variable, one of `observables`.
@@ -189,17 +189,17 @@ class AbstractLink(HTMLRepr, abc.ABC):
         """
 
     def center(self, name: str, prediction: Prediction, noise: Noise) -> PerView:
-        """The reading without noise, in the unit of the reading."""
+        """Return the noise-free reading, in the unit of the reading."""
         return prediction[name]
 
     def reading(self, value: PerView) -> PerView:
-        """The reading as the distribution takes it; unchanged unless a link says otherwise."""
+        """Return the reading in the form of the distribution; unchanged by default."""
         return value
 
 
 @dataclasses.dataclass(frozen=True)
 class _DopLink(AbstractLink):
-    """Shared by the links of the unsigned degree of polarization: the margin at 0 and 1."""
+    """Base class of links of the unsigned degree of polarization: the margin at 0 and 1."""
 
     observables: ClassVar[tuple[str, ...]] = ("dop",)
     margin: float = 1e-4
@@ -276,7 +276,7 @@ class LogitNormalLink(_DopLink):
 
 @dataclasses.dataclass(frozen=True)
 class NormalLink(AbstractLink):
-    """Normal noise of one constant scale: the ablation that ignores bounds and brightness."""
+    """Normal noise of constant scale: an ablation that ignores bounds and brightness."""
 
     observables: ClassVar[tuple[str, ...]] = ("dop", "q", "u")
     parameters: ClassVar[tuple[str, ...]] = ("normal_scale",)
@@ -291,7 +291,7 @@ class NormalLink(AbstractLink):
 
 @dataclasses.dataclass(frozen=True)
 class StokesLink(AbstractLink):
-    r"""Noise of the signed normalized Stokes parameters, free of the bias of an unsigned DoP.
+    r"""Noise of signed normalized Stokes parameters, without the bias of an unsigned DoP.
 
     Where the capture states an error for each reading, the scale is `stokes_error_factor`
     times that error. Elsewhere it is the shot noise of a view,
@@ -355,7 +355,7 @@ class StokesLink(AbstractLink):
         return dist.StudentT(freedom, location, scale)
 
     def _brightness(self, prediction: Prediction, data: Observations, noise: Noise) -> PerView:
-        """The light of each view over full scale, by which its polarization is known."""
+        """Return the light of each view over full scale, which sets its noise."""
         brightness = data.brightness
         if "exposure" in noise:
             # Not the reading, which is noise where there is no light. At full scale it bends
@@ -426,7 +426,7 @@ class StudentTLink(AbstractLink):
 
 
 def noise_parameters(links: Mapping[str, AbstractLink]) -> tuple[str, ...]:
-    """The noise parameters that a set of links reads, each once, in the order of the links."""
+    """Return the noise parameters of a set of links, each once, in order."""
     return tuple(dict.fromkeys(name for link in links.values() for name in link.parameters))
 
 
@@ -440,4 +440,4 @@ PERFECT: Mapping[str, float] = MappingProxyType(
         "intensity_scale": 0.0,
     }
 )
-"""Value of each noise parameter at which readings are perfect."""
+"""Value of each noise parameter that means noise-free readings."""

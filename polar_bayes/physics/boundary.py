@@ -48,21 +48,21 @@ class Diattenuation(NamedTuple):
 
     @property
     def cross(self) -> Array:
-        """x, the factor of light polarized at 45 degrees, in the sign of normal incidence."""
+        """x, the factor of light polarized at 45 degrees, signed as at normal incidence."""
         return self.mean - self.shortfall * self.sin_squared**2
 
     def scaled(self, factor: Array) -> "Diattenuation":
-        """Followed by a filter that treats all light alike."""
+        """Append a filter that attenuates all light equally."""
         mean, contrast, shortfall = (factor * part for part in self[:3])
         return Diattenuation(mean, contrast, shortfall, self.sin_squared)
 
     def plus(self, other: "Diattenuation") -> "Diattenuation":
-        """Both paths together."""
+        """Add the light of another path."""
         mean, contrast, shortfall = map(jnp.add, self[:3], other[:3])
         return Diattenuation(mean, contrast, shortfall, self.sin_squared)
 
     def times(self, other: "Diattenuation") -> "Diattenuation":
-        """One after the other."""
+        """Append another interface."""
         b = self.sin_squared
         return self._replace(
             mean=self.mean * other.mean + self.contrast * other.contrast * b**2,
@@ -74,7 +74,7 @@ class Diattenuation(NamedTuple):
         )
 
     def repeated(self) -> "Diattenuation":
-        """All round trips together, 1 + this + this^2 + ... = 1/(1 - this)."""
+        """Sum all round trips, 1 + this + this^2 + ... = 1/(1 - this)."""
         b = self.sin_squared
         left = 1.0 - self.mean
         s_and_p = (left - self.contrast * b) * (left + self.contrast * b)
@@ -87,41 +87,41 @@ class Diattenuation(NamedTuple):
 
 
 class Medium(NamedTuple):
-    """A medium on the path of light, with Q, the index times the cosine inside."""
+    """A medium on the path of light, with Q, its index times the cosine inside."""
 
     refractive_index: Array
     normal: Array
 
 
 class Film(NamedTuple):
-    """A layer thin enough for interference, and the phase of one round trip, exp(2 i delta)."""
+    """A layer thin enough for interference, with the phase of one round trip, exp(2 i delta)."""
 
     medium: Medium
     phase: Array
 
 
 class Amplitude(NamedTuple):
-    """Field reflected along s and p: mean +- contrast B. Real for a bare boundary."""
+    """Reflected field along s and p, mean +- contrast B; real for a bare boundary."""
 
     mean: Array
     contrast: Array
 
     def times(self, other: "Amplitude", sin_squared: Array) -> "Amplitude":
-        """One after the other."""
+        """Return the product with another amplitude."""
         return Amplitude(
             self.mean * other.mean + self.contrast * other.contrast * sin_squared**2,
             self.mean * other.contrast + self.contrast * other.mean,
         )
 
     def over(self, other: "Amplitude", sin_squared: Array) -> "Amplitude":
-        """Divided by another, which is zero neither along s nor along p."""
+        """Return the quotient by another amplitude that vanishes neither along s nor along p."""
         difference = other.contrast * sin_squared
         product = (other.mean - difference) * (other.mean + difference)
         inverse = Amplitude(other.mean / product, -other.contrast / product)
         return self.times(inverse, sin_squared)
 
     def power(self, sin_squared: Array) -> Diattenuation:
-        """Squared moduli."""
+        """Return squared moduli."""
         straight, crossed = _square(self.mean), _square(self.contrast)
         both = jnp.real(self.mean) * jnp.real(self.contrast)
         both = both + jnp.imag(self.mean) * jnp.imag(self.contrast)
@@ -148,7 +148,7 @@ def reflection(above: Medium, below: Medium, sin_squared: Array) -> Diattenuatio
 def relative_reflection(
     above: Medium, below: Medium, sin_squared: Array, step: Array | float = 1.0
 ) -> Diattenuation:
-    """The same without the factor (n_2^2 - n_1^2)^2, whose root `step` would put back."""
+    """Reflected power without the factor (n_2^2 - n_1^2)^2, whose root is `step`."""
     a, b = above.normal * below.normal, sin_squared
     # Inverse by inverse, and squared last: near grazing, derivatives of the whole would overflow
     # single precision.
@@ -158,13 +158,13 @@ def relative_reflection(
 
 
 def reflection_shape(above: Medium, below: Medium, sin_squared: Array) -> Diattenuation:
-    """The same in proportion, without any factor: its size is near 1."""
+    """Reflected power up to any factor, scaled to a size near 1."""
     a, b = above.normal * below.normal, sin_squared
     return Diattenuation(a**2 + b**2, 2.0 * a, 2.0 * jnp.ones_like(a), b)
 
 
 def transmission(above: Medium, below: Medium, sin_squared: Array) -> Diattenuation:
-    """Power that a bare boundary lets pass, the same in both directions."""
+    """Power that a bare boundary transmits, equal in both directions."""
     a, b, total = above.normal * below.normal, sin_squared, above.normal + below.normal
     inverse = 1.0 / total
     share = inverse / (a + b)
@@ -184,7 +184,7 @@ def transmission(above: Medium, below: Medium, sin_squared: Array) -> Diattenuat
 def filmed(
     above: Medium, films: tuple[Film, ...], below: Medium, sin_squared: Array
 ) -> tuple[Diattenuation, Diattenuation]:
-    r"""Power that a boundary with thin films reflects and lets pass (Airy's formulas).
+    r"""Power that a boundary with thin films reflects and transmits (Airy's formulas).
 
     $$ r = \frac{r_1 + r_2 e^{2i\delta}}{1 + r_1 r_2 e^{2i\delta}}, \qquad
        T = \frac{T_1 T_2}{|1 + r_1 r_2 e^{2i\delta}|^2} $$
@@ -217,7 +217,7 @@ def _rho(above: Medium, below: Medium) -> Array:
 
 
 def _square_difference(above: Medium, below: Medium) -> Array:
-    """n_2^2 - n_1^2."""
+    """Difference of squared indices, n_2^2 - n_1^2."""
     first, second = above.refractive_index, below.refractive_index
     return (second - first) * (second + first)
 

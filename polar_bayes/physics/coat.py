@@ -1,4 +1,4 @@
-"""What lies on the body, or behind it: coats, thin films, stacks of them, and the back of a plate.
+"""Layers on the body and behind it: coats, thin films, stacks, and the back of a plate.
 
 A coat lies on every facet of a rough surface alike. One of your own says which layers it adds.
 """
@@ -22,7 +22,7 @@ class AbstractCoat(Part):
 
     @abc.abstractmethod
     def layers(self, parameters: Parameters, wavelength: Array | None) -> tuple[Layer, ...]:
-        """Layers from the top down.
+        """Return layers from the top down.
 
         Args:
             parameters: Material parameters by name. Each broadcasts with (..., view).
@@ -156,7 +156,7 @@ class BackFace(Part):
     absorbance: Annotated[Setting, Range(0.0, 100.0)] = 0.0
 
     def behind(self, front: Stack, parameters: Parameters) -> Stack:
-        """The whole plate: its front, the plate as one thick layer, and air behind it.
+        """Return the stack of the whole plate: front, plate as a thick layer, and air behind it.
 
         Args:
             front: The body, which is the plate, and what lies on it.

@@ -1,4 +1,4 @@
-"""How the index of the body changes with color: laws that replace one index per wavelength."""
+"""Dispersion laws: the index of the body over wavelength, in place of one index per wavelength."""
 
 import abc
 import dataclasses
@@ -20,7 +20,7 @@ class AbstractDispersion(Part):
 
     @abc.abstractmethod
     def index(self, parameters: Parameters, wavelength: Array) -> Array:
-        """Refractive index.
+        """Return the refractive index.
 
         Args:
             parameters: The law's parameters by name. Each broadcasts with (..., view).

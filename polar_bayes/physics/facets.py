@@ -49,7 +49,7 @@ CROWDING_ALONG, CROWDING_ACROSS = 0.4, 0.85
 
 @dataclasses.dataclass(frozen=True)
 class FacetQuadrature(Part):
-    """How many facets stand for all: one dial of what accuracy costs in time.
+    """Number of facets in the quadrature, which trades accuracy for time.
 
     Largest error of the degree of polarization for roughness .01 to .3, index 1.2 to 2, and zenith
     angles up to 89 degrees, against 64 x 64 facets (benchmarks/facet_quadrature.py):
@@ -97,12 +97,12 @@ class FacetQuadrature(Part):
         return tuple(rule for rule in fewer if rule.along * rule.across < nodes)
 
     def rule_along(self) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes and weights on (0, 1), denser at both borders."""
+        """Nodes and weights on (0, 1), denser at both ends."""
         node, weight = _crowded_gauss_legendre(self.along, CROWDING_ALONG)
         return 0.5 * (1.0 + node), 0.5 * weight
 
     def rule_across(self) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes and weights on (0, 1), denser at the limit, where chords shrink to nothing.
+        """Nodes and weights on (0, 1), denser at the limit, where chords vanish.
 
         Slopes of both signs are alike: half of a rule over both is exact to twice the order.
         """
@@ -114,30 +114,30 @@ class FacetQuadrature(Part):
         return unit_rule(self.across)
 
     def rule_steep(self) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes and weights on (0, 1) for the steep slopes, denser at both borders."""
+        """Nodes and weights on (0, 1) for the steep slopes, denser at both ends."""
         return FacetQuadrature(min(self.along + self.across, 64), 1).rule_along()
 
 
 class Window(NamedTuple):
-    """Border of the facets that matter, in slope coordinates."""
+    """Boundary of the facets that contribute, in slope coordinates."""
 
     limit: Array
-    """Largest slope across the plane of the viewer, (..., view), or () for all alike."""
+    """Largest slope across the plane of the viewer, (..., view), or () if equal for all views."""
     edges: Callable[[Array], tuple[Array, Array]]
-    """From that slope to the smallest and largest slope in the plane."""
+    """Function from a slope across to the smallest and largest slope in the plane."""
     turned: "Callable[[Axes], TurnedWindow]"
-    """The same border in the frame of grooves."""
+    """Function that returns the same boundary in the frame of grooves."""
 
 
 class TurnedWindow(NamedTuple):
-    """The border along the gentle slopes s of grooves and their steep slopes t."""
+    """The boundary in the gentle slopes s along grooves and the steep slopes t across."""
 
     behind: Array
     """Minus the smallest s, (..., view)."""
     ahead: Array
-    """The largest s."""
+    """The largest s, (..., view)."""
     edges: Callable[[Array], tuple[Array, Array]]
-    """From s to the smallest and largest t."""
+    """Function from s to the smallest and largest t."""
 
 
 class Facets(NamedTuple):
@@ -166,7 +166,7 @@ class Facets(NamedTuple):
 
 
 def seen(sin_view: Array, cos_view: Array) -> Window:
-    """Border of all facets that face the viewer."""
+    """Boundary of all facets that face the viewer."""
 
     def edges(across: Array) -> tuple[Array, Array]:
         del across
@@ -198,7 +198,7 @@ def seen(sin_view: Array, cos_view: Array) -> Window:
 
 
 def above_horizon(sin_view: Array, cos_view: Array) -> Window:
-    """Border of the facets that mirror the viewer's ray into the sky: a circle of slopes."""
+    """Boundary of facets that mirror the viewer's ray into the sky: a circle of slopes."""
 
     def edges(across: Array) -> tuple[Array, Array]:
         forwards = sin_view >= 0.0
@@ -228,7 +228,7 @@ def above_horizon(sin_view: Array, cos_view: Array) -> Window:
 
 
 def inside_disc(sin_view: Array, cos_view: Array, sin_half: float) -> Window:
-    """Border of the facets that mirror the viewer's ray into a disc around the mirror direction."""
+    """Boundary of facets that mirror the viewer's ray into a disc around the mirror direction."""
     sky = above_horizon(sin_view, cos_view)
     spare = (cos_view - sin_half) * (cos_view + sin_half)
     limit = sin_half / jnp.sqrt(jnp.maximum(spare, (sin_half * cos_view) ** 2))
@@ -279,7 +279,7 @@ class Microsurface:
     ellipse: SlopeEllipse
 
     def per_facet(self) -> "Microsurface":
-        """The same with an axis for facets in front of the views."""
+        """Add an axis for facets in front of the views."""
         return dataclasses.replace(self, ellipse=per_facet(self.ellipse))
 
     def density(self, geometry: Geometry, tan_squared: Array) -> Array:
@@ -303,7 +303,7 @@ class Microsurface:
         return self.distribution.density(alike, jnp.sqrt(peak)) * stretch**2
 
     def visible(self, x: Array, y: Array) -> Array:
-        """G1, the share of facets that see one direction."""
+        """Share of facets that see one direction, G1."""
         ellipse = self.ellipse
         if ellipse.shear is None:
             return self.distribution.shadowing(x**2 + y**2, ellipse.across)
@@ -383,7 +383,7 @@ class Microsurface:
 def sum_facets(
     sample: Facets, weight: Array, power: Diattenuation, *, least: float | None = None
 ) -> Light:
-    """Light of all facets together."""
+    """Sum the light of all facets."""
     total = jnp.sum(weight * power.mean, axis=-2)
     if least is not None:
         total = jnp.maximum(total, least)

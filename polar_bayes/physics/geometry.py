@@ -1,4 +1,4 @@
-"""Where the viewer and the light stand, and the one facet that mirrors one into the other.
+"""Directions of viewer and light, and the facet that mirrors one into the other.
 
 The surface normal is z. Azimuths 180 degrees apart are the specular side. Nothing here subtracts
 two nearly equal numbers: cosines near grazing come from the complement of the zenith angle, and
@@ -79,19 +79,19 @@ class Geometry(NamedTuple):
         return cls(*(jax.device_put(found) if of is np else found))
 
     def leaning(self, view: ArrayLike = 0.0, light: ArrayLike = 0.0) -> "Geometry":
-        """Zeniths larger by so many degrees, none beyond 89.999."""
+        """Increase all zeniths by an angle in degrees, up to 89.999."""
         return self._replace(
             view_zenith=jnp.minimum(self.view_zenith + view, STEEPEST_ZENITH),
             light_zenith=jnp.minimum(self.light_zenith + light, STEEPEST_ZENITH),
         )
 
     def reversed(self) -> "Geometry":
-        """Light and viewer in each other's place."""
+        """Exchange viewer and light."""
         view, light = self[:2], self[2:4]
         return Geometry(*light, *view, self.wavelength)
 
     def resolved(self) -> "Geometry":
-        """In single precision, whose zeniths are known to 8e-6 degrees: none beyond 89.999."""
+        """Limit zeniths to 89.999 degrees in single precision, which resolves 8e-6 degrees."""
         if jnp.finfo(self.dtype).eps < 1e-10:
             return self
         view, light = (

@@ -1,4 +1,4 @@
-r"""Light that a turbid half space behind a smooth interface scatters back: all orders, polarized.
+r"""Light that a turbid half space behind a smooth interface scatters: all orders, polarized.
 
 Scattering is a mixture: a share p (the polarized fraction) follows Rayleigh's law, a share 1 - p
 is isotropic and depolarizes. Such a mixture sees only four functions f of direction and light, in
@@ -85,14 +85,14 @@ class Ray(NamedTuple):
 
 
 class _Moments(NamedTuple):
-    """What gives H at any cosine: a part without cosine, and one of each node."""
+    """Coefficients of H at any cosine: a constant, and a term for each node."""
 
     constant: Array  # (pair, 2, 2, ...)
     term: Array  # (pair, 2, 2, node, ...)
 
 
 class _Interface(NamedTuple):
-    """The interface from inside: reflectances, and the share of U that is kept. (node, ...)."""
+    """Reflectances of the interface from inside, and the retained share of U, (node, ...)."""
 
     cosine: Array
     weight: Array  # of integrals over mu dmu
@@ -102,7 +102,7 @@ class _Interface(NamedTuple):
 
 
 class _Turned(NamedTuple):
-    """Light that the interface turns back: X, and the sum over its returns (1 - X N)^-1."""
+    """Light that the interface reflects back: X, and the sum over its returns (1 - X N)^-1."""
 
     cosine: Array  # (node, ...)
     reflection: Array  # (pair, 2, 2, node, ...)
@@ -110,7 +110,7 @@ class _Turned(NamedTuple):
 
 
 def refract(sine: Array, cosine: Array, refractive_index: Array) -> Ray:
-    """Direction inside of light that meets a smooth interface."""
+    """Direction inside the body of light that meets a smooth interface."""
     inside = medium(refractive_index, jnp.maximum(cosine, GRAZING) ** 2)
     return Ray(inside.normal / refractive_index, sine / refractive_index)
 
@@ -124,7 +124,7 @@ def scatter(
     polarized_fraction: Array,
     refractive_index: Array | None,
 ) -> tuple[Array, Array, Array]:
-    r"""Light of a beam that is scattered towards the viewer, still inside the body.
+    r"""Light of a beam that is scattered towards the viewer, before it leaves the body.
 
     $$ [I E_0 + Q E_1,\; I E_1 + Q E_0,\; U \sqrt{E_0^2 - E_1^2}] / n^2 $$
     """
@@ -168,34 +168,34 @@ def scatter(
 
 
 def _material(*properties: Array | float) -> tuple[Array, Array, Array]:
-    """Absorption above its floor, polarized fraction and index, of one shape and precision."""
+    """Absorption above its floor, polarized fraction and index, in one shape and precision."""
     dtype = jnp.result_type(float, *properties)
     a, p, n = jnp.broadcast_arrays(*(jnp.asarray(x, dtype) for x in properties))
     return at_least(a, CLEAREST), p, n
 
 
 def _column(nodes: np.ndarray, like: Array) -> Array:
-    """Constants in the precision of the data, with axes for it behind their own."""
+    """Constants in the precision of the data, with axes for the data behind their own."""
     return jnp.asarray(nodes, like.dtype).reshape(nodes.shape + (1,) * like.ndim)
 
 
 def _stack(shape: tuple[int, ...], *arrays: Array) -> Array:
-    """Arrays of one shape, on new axes in front."""
+    """Stack arrays of one shape on new leading axes."""
     return jnp.stack(arrays).reshape(*shape, *arrays[0].shape)
 
 
 def _parts_of(p: Array) -> Array:
-    """L, how much each function of each pair takes part in scattering: (pair, 2, ...)."""
+    """Weights L of each function of each pair in scattering, (pair, 2, ...)."""
     return _stack((2, 2), jnp.ones_like(p), 0.5 * p, p, p)
 
 
 def _seen(cosine: Array, intensity: Array, q: Array) -> tuple[Array, Array]:
-    """The functions of pair 0 of some light."""
+    """Components of light in the functions of pair 0."""
     return intensity, 0.5 * (_p_apart(cosine) * (intensity - q) - (intensity + q))
 
 
 def _unseen(cosine: Array, pair: Array) -> tuple[Array, Array]:
-    """The light, s and p, that functions of pair 0 stand for."""
+    """Light, s and p, from its components in the functions of pair 0."""
     return 0.5 * (pair[0] - pair[1]), 0.5 * (pair[0] + _p_apart(cosine) * pair[1])
 
 
@@ -252,7 +252,7 @@ def _h_at(moments: _Moments, cosine: Array) -> Array:
 
 
 def _at_nodes(moments: _Moments) -> _Moments:
-    """The same for cosines of shape (node, ...)."""
+    """Moments that broadcast with cosines of shape (node, ...)."""
     return _Moments(moments.constant[:, :, :, None], moments.term[:, :, :, :, None])
 
 
@@ -263,7 +263,7 @@ def critical_cosine_squared(n: Array) -> Array:
 
 
 def _interface(n: Array) -> _Interface:
-    """Nodes in the cosine beyond the critical angle; within it, in that of the light outside."""
+    """Reflectances at nodes beyond the critical angle, and at nodes of light that can leave."""
     node, weight = (_column(x, n) for x in unit_rule(BEYOND))
     critical = critical_cosine_squared(n)
     cosine = jnp.sqrt(critical) * node
@@ -285,7 +285,7 @@ def _interface(n: Array) -> _Interface:
 
 
 def _turned_back(moments: _Moments, a: Array, p: Array, n: Array) -> _Turned:
-    """What the interface does to light on its way out, and all that follows from it."""
+    """Reflection of light on its way out, and the sum over all returns."""
     mu, weight, s, p_light, diagonal = _interface(n)
     h, apart, none = _h_at(_at_nodes(moments), mu), _p_apart(mu), jnp.zeros_like(mu)
     cross = 0.5 * (apart * p_light - s)
@@ -306,6 +306,6 @@ def _turned_back(moments: _Moments, a: Array, p: Array, n: Array) -> _Turned:
 
 
 def _after_returns(turned: _Turned, source: Array, cos_view: Array) -> Array:
-    """Light that leaves towards the viewer after it has entered again: (pair, 2, ...)."""
+    """Light towards the viewer after one or more reflections back inside, (pair, 2, ...)."""
     total = jnp.einsum("gaibj...,gbj...->gai...", turned.returns, source, precision="highest")
     return jnp.sum(total / (turned.cosine + cos_view), axis=2)

@@ -1,4 +1,4 @@
-"""Where the light comes from: how it lights a rough surface and how much of it enters the body."""
+"""Illumination: how light reaches a rough surface, and how much of it enters the body."""
 
 import abc
 import dataclasses
@@ -30,13 +30,13 @@ from polar_bayes.physics.stokes import (
 )
 
 Beams = tuple[Geometry, Light]
-"""Rays that come from the light, and what of each enters the body."""
+"""Rays from the light source, and the part of each that enters the body."""
 
 Turns = tuple[tuple[float, float], ...]
-"""Azimuths, degree, and their shares, which sum to 1."""
+"""Azimuths in degrees with their weights, which sum to 1."""
 
 FOUR_TURNS: Turns = ((0.0, 0.25), (90.0, 0.25), (180.0, 0.25), (270.0, 0.25))
-"""They sum up once and twice around to nothing: all that Rayleigh's law knows of azimuth."""
+"""Azimuths whose first and second harmonics vanish: Rayleigh scattering has no others."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +71,7 @@ class AbstractIllumination(Part):
 
     @abc.abstractmethod
     def rays(self, geometry: Geometry, around: Turns = FOUR_TURNS) -> tuple[Geometry, Array]:
-        """Beams that stand for the source, for a body that asks where its light comes from.
+        """Beams that represent the source, for bodies that depend on the direction of light.
 
         Args:
             geometry: Directions. Shape (..., view), degree.
@@ -176,7 +176,7 @@ class AbstractExtendedSource(AbstractIllumination):
 
     @abc.abstractmethod
     def border(self, sin_view: Array, cos_view: Array) -> Window:
-        """Slopes of the facets that mirror the viewer's ray into the source.
+        """Boundary of the facets that mirror the viewer's ray into the source.
 
         Args:
             sin_view: Sine of the view zenith. Shape (..., view), 1.
@@ -289,7 +289,7 @@ class Disc(AbstractExtendedSource):
         return rays, irradiance
 
     def _directions(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Cosine from the axis, sine times cosine of azimuth, and solid angle of each direction."""
+        """Cosine from the axis, sine times cosine of azimuth, and solid angle of directions."""
         # Exact to 1e-6 of the light that enters the body while the disc is above the horizon, and
         # to .002 (half width 15, 89 degrees) where the horizon cuts it.
         count = 8  # of angles from the center, and of azimuths

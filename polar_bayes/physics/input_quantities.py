@@ -1,4 +1,4 @@
-"""What a set-up is known to: terms of an instrument that are off from what a capture states.
+"""Input quantities: possible errors of a set-up, such as the direction of a lamp.
 
 Each has one parameter, its offset, which is zero in a perfect set-up and has a normal prior whose
 width is the standard uncertainty of the quantity. Readings seldom determine an offset alone; they
@@ -34,16 +34,16 @@ __all__ = [
 ]
 
 STRAY = 1e-6
-"""Share of the light that reaches a frame which a perfect set-up would leave dark."""
+"""Share of stray light in a frame that a perfect set-up would leave dark."""
 
 
 @dataclasses.dataclass(frozen=True)
 class AbstractInputQuantity(AbstractInstrumentTerm):
-    """Something that a set-up is known to. Override `aim`, `record`, or both."""
+    """A quantity of the set-up with an uncertainty. Override `aim`, `record`, or both."""
 
     name: ClassVar[str]
     needs: ClassVar[tuple[str, ...]] = ()
-    """Variables of a capture without which it changes no reading."""
+    """Variables of a capture without which the quantity changes no reading."""
 
     @property
     @override
@@ -60,13 +60,13 @@ class AbstractInputQuantity(AbstractInstrumentTerm):
         return ()  # it is no effect that readings could call for
 
     def offset(self, parameters: Parameters) -> Array:
-        """How far the set-up is off."""
+        """Return the error of the set-up."""
         return parameters[self.parameters[0]]
 
 
 @dataclasses.dataclass(frozen=True)
 class LightZenith(AbstractInputQuantity):
-    """The light is further from the normal than stated, by `light_zenith_offset` degrees."""
+    """Error of the light's zenith: it is larger than stated by `light_zenith_offset` degrees."""
 
     name = "light_zenith"
 
@@ -77,7 +77,7 @@ class LightZenith(AbstractInputQuantity):
 
 @dataclasses.dataclass(frozen=True)
 class LightAzimuth(AbstractInputQuantity):
-    """The light is turned about the normal, by `light_azimuth_offset` degrees."""
+    """Error of the light's azimuth: it is larger than stated by `light_azimuth_offset` degrees."""
 
     name = "light_azimuth"
 
@@ -88,7 +88,7 @@ class LightAzimuth(AbstractInputQuantity):
 
 @dataclasses.dataclass(frozen=True)
 class ViewZenithScale(AbstractInputQuantity):
-    """Zeniths of the views are larger than read by a share: a focal length, a gear, a scale."""
+    """Relative error of view zeniths, such as by a focal length, a gear or a scale."""
 
     name = "view_zenith_scale"
 
@@ -110,7 +110,7 @@ class IncidenceAngle(AbstractInputQuantity):
 
 @dataclasses.dataclass(frozen=True)
 class SampleLean(AbstractInputQuantity):
-    """The normal of the sample leans away from the light, in its plane; unit degree."""
+    """Tilt of the sample's normal away from the light, in its plane; unit degree."""
 
     name = "sample_lean"
 
@@ -123,7 +123,7 @@ class SampleLean(AbstractInputQuantity):
 
 @dataclasses.dataclass(frozen=True)
 class AnalyzerRoll(AbstractInputQuantity):
-    """The zero of the analyzer is turned, which mixes q and u; unit degree."""
+    """Error of the analyzer's zero, which mixes q and u; unit degree."""
 
     name = "analyzer_roll"
     needs = ("q", "u")
@@ -148,7 +148,7 @@ class PolarizationLoss(AbstractInputQuantity):
 
 @dataclasses.dataclass(frozen=True)
 class AmbientLight(AbstractInputQuantity):
-    """Unpolarized light besides the lamp's adds a share of the brightest reading to every view."""
+    """Unpolarized ambient light, as a share of the brightest reading, in every view."""
 
     name = "ambient_light"
 
@@ -160,7 +160,7 @@ class AmbientLight(AbstractInputQuantity):
 
 @dataclasses.dataclass(frozen=True)
 class ToneCurve(AbstractInputQuantity):
-    """Counts grow as a power of light, whose exponent (gamma) is above 1 by its offset."""
+    """Error of the gamma: counts are a power of light whose exponent exceeds 1 by its offset."""
 
     name = "tone_curve"
 
@@ -174,6 +174,6 @@ class ToneCurve(AbstractInputQuantity):
 
 
 def _bent(contrast: Array, offset: Array) -> Array:
-    """The contrast of two frames whose counts are a power 1 + offset of light."""
+    """Contrast of two frames whose counts are light to the power 1 + offset."""
     inside = (1.0 - STRAY) * contrast
     return contrast + jnp.tanh((1.0 + offset) * jnp.arctanh(inside)) - inside

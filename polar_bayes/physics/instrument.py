@@ -1,4 +1,4 @@
-"""What an instrument does to light before a number is written down. Every term is optional.
+"""Instrument terms: effects on light before a number is recorded. Every term is optional.
 
 Terms aim first (the angles a light path really has), then record in the order given. Parameters
 reach a term with a trailing view axis.
@@ -68,7 +68,7 @@ class AbstractInstrumentTerm(Part):
         return (None,)
 
     def aim(self, parameters: Parameters, geometry: Geometry) -> Geometry:
-        """Directions the light really takes, from those that were read off.
+        """Return the true directions of light, from those that were read.
 
         Args:
             parameters: Instrument parameters by name. Each broadcasts with (..., view).
@@ -81,7 +81,7 @@ class AbstractInstrumentTerm(Part):
         return geometry
 
     def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
-        """Light as the instrument records it.
+        """Return the light as the instrument records it.
 
         Args:
             parameters: Instrument parameters by name. Each broadcasts with (..., view).
@@ -97,7 +97,7 @@ class AbstractInstrumentTerm(Part):
 
 @dataclasses.dataclass(frozen=True)
 class Instrument(HTMLRepr):
-    """Terms that act one after the other.
+    """Terms that are applied one after the other.
 
     Args:
         terms: Instrument terms, in the order in which light meets them.
@@ -127,13 +127,13 @@ class Instrument(HTMLRepr):
         return parameters_of(*self.terms)
 
     def aim(self, parameters: Parameters, geometry: Geometry) -> Geometry:
-        """Directions the light really takes; see `AbstractInstrumentTerm.aim`."""
+        """Return the true directions of light; see `AbstractInstrumentTerm.aim`."""
         for term in self.terms:
             geometry = term.aim(parameters, geometry)
         return geometry
 
     def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
-        """Light as recorded; see `AbstractInstrumentTerm.record`."""
+        """Return the light as recorded; see `AbstractInstrumentTerm.record`."""
         for term in self.terms:
             light = term.record(parameters, geometry, light)
         return light
@@ -141,7 +141,7 @@ class Instrument(HTMLRepr):
 
 @dataclasses.dataclass(frozen=True)
 class AngleZero(AbstractInstrumentTerm):
-    """The angle scale is off: both zeniths are larger by `angle_zero` degrees than read."""
+    """Offset of the angle scale: both zeniths are larger by `angle_zero` degrees than read."""
 
     parameters: ClassVar[tuple[str, ...]] = ("angle_zero",)
     neutral: ClassVar[Mapping[str, float]] = MappingProxyType({"angle_zero": 0.0})
@@ -153,7 +153,7 @@ class AngleZero(AbstractInstrumentTerm):
 
 @dataclasses.dataclass(frozen=True)
 class DolpGain(AbstractInstrumentTerm):
-    """A polarizer that is not perfect: q and u shrink to `dolp_gain` of themselves."""
+    """Imperfect polarizer: q and u are multiplied by `dolp_gain`."""
 
     parameters: ClassVar[tuple[str, ...]] = ("dolp_gain",)
     neutral: ClassVar[Mapping[str, float]] = MappingProxyType({"dolp_gain": 1.0})
@@ -166,7 +166,7 @@ class DolpGain(AbstractInstrumentTerm):
 
 @dataclasses.dataclass(frozen=True)
 class ChannelGain(AbstractInstrumentTerm):
-    """The s channel is `channel_gain_ratio` times as sensitive as the p channel."""
+    """Gain ratio of the channels: s is `channel_gain_ratio` times as sensitive as p."""
 
     parameters: ClassVar[tuple[str, ...]] = ("channel_gain_ratio",)
     neutral: ClassVar[Mapping[str, float]] = MappingProxyType({"channel_gain_ratio": 1.0})
@@ -181,7 +181,7 @@ class ChannelGain(AbstractInstrumentTerm):
 
 @dataclasses.dataclass(frozen=True)
 class Leakage(AbstractInstrumentTerm):
-    """Each channel also sees a share `leakage` of the other: s' = s + l p, p' = p + l s.
+    """Leakage of each channel into the other: s' = s + l p, p' = p + l s, with l = `leakage`.
 
     Readings are normalized so that the brightness stays: q and u shrink by (1 - l)/(1 + l).
     """
@@ -198,7 +198,7 @@ class Leakage(AbstractInstrumentTerm):
 
 @dataclasses.dataclass(frozen=True)
 class DarkLevel(AbstractInstrumentTerm):
-    """Unpolarized light `dark_level`, in units of the predicted intensity, adds to every view."""
+    """Unpolarized light `dark_level`, in units of the predicted intensity, in every view."""
 
     parameters: ClassVar[tuple[str, ...]] = ("dark_level",)
     neutral: ClassVar[Mapping[str, float]] = MappingProxyType({"dark_level": 0.0})
@@ -215,7 +215,7 @@ class DarkLevel(AbstractInstrumentTerm):
 
 @dataclasses.dataclass(frozen=True)
 class BeamOverlap(AbstractInstrumentTerm):
-    r"""Towards grazing the beam's footprint outgrows the sample, and light is lost.
+    r"""Loss of light near grazing, where the footprint of the beam is larger than the sample.
 
     $$ I' = I \Big(1 + \Big(\frac{\cos\theta_o}{\cos\theta_v}\Big)^{8}\Big)^{-1/8} $$
 
@@ -238,7 +238,7 @@ class BeamOverlap(AbstractInstrumentTerm):
 
 @dataclasses.dataclass(frozen=True)
 class Analyzer(AbstractInstrumentTerm):
-    r"""Intensity is recorded behind a linear polarizer.
+    r"""A linear polarizer in front of the detector of the intensity.
 
     $$ I' = I (1 + q \cos 2\chi + u \sin 2\chi)/2 $$
 
@@ -272,7 +272,7 @@ class Analyzer(AbstractInstrumentTerm):
 
 @dataclasses.dataclass(frozen=True)
 class Saturation(AbstractInstrumentTerm):
-    """The sensor stops at a level: brighter views are recorded as that level.
+    """Saturation of the sensor: brighter views are recorded as its level.
 
     For predictions and simulations; `StudentTLink` knows the level of a capture by itself.
 
@@ -313,7 +313,7 @@ class Direction(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class TiltedNormal(Part):
-    r"""The true normal is tilted by small angles towards azimuth 0 and towards azimuth 90.
+    r"""Tilt of the true normal by small angles towards azimuth 0 and towards azimuth 90.
 
     $$ n \propto (\tan t_x, \tan t_y, 1) $$
 
@@ -345,7 +345,7 @@ class TiltedNormal(Part):
     def enter(
         self, parameters: Parameters, geometry: Geometry
     ) -> tuple[Geometry, tuple[Array, Array]]:
-        """Directions in the frame of the true normal, and the turn of the viewer's frame."""
+        """Return directions in the frame of the true normal, and the turn of the viewer's frame."""
         tilts = (value_of(tilt, parameters) for tilt in (self.tilt_x, self.tilt_y))
         # A sampler may ask for more than 80 degrees along an axis, and gets 80.
         slopes = [jnp.tan(jnp.deg2rad(jnp.clip(tilt, -80.0, 80.0))) for tilt in tilts]
@@ -357,13 +357,13 @@ class TiltedNormal(Part):
         return inside, view.turn
 
     def leave(self, light: Light, turn: tuple[Array, Array]) -> Light:
-        """Light in the stated frame of the viewer, from that in the true one."""
+        """Return light in the stated frame of the viewer, from that in the true frame."""
         cos, sin = turn
         return Light(light.intensity, *in_turned_frame(light.q, light.u, (cos, -sin)))
 
 
 def tilted_direction(zenith: Array, azimuth: Array, slope_x: Array, slope_y: Array) -> Direction:
-    r"""A direction as the normal (slope_x, slope_y, 1)/N sees it.
+    r"""Return a direction in the frame of the normal (slope_x, slope_y, 1)/N.
 
     $$ \frac{s - p c}{N}, \quad \frac{-t}{N} $$
 
@@ -413,7 +413,7 @@ BEFORE, SPAN = 13.5, 117.0
 
 @dataclasses.dataclass(frozen=True)
 class Discrepancy(AbstractInstrumentTerm):
-    r"""A smooth factor exp(f) on the ratio of channels s and p, over the view zenith.
+    r"""Smooth factor exp(f) on the ratio of channels s and p, over the view zenith.
 
     $$ f(\theta) = \text{amplitude} \sum_j w_j \phi_j(\theta), \qquad
        q' = \frac{q+t}{1+qt}, \quad t = \tanh(f/2) $$
@@ -462,14 +462,14 @@ class Discrepancy(AbstractInstrumentTerm):
         return diattenuate(light, jnp.tanh(half_log_ratio), 1.0 / jnp.cosh(half_log_ratio))
 
     def functions(self, view_zenith: Array) -> Array:
-        """Basis functions that vanish at 0: (..., view) -> (..., basis, view)."""
+        """Return basis functions that vanish at 0: (..., view) -> (..., basis, view)."""
         dtype = jnp.result_type(float, view_zenith)
         frequency, mixing = (jnp.asarray(x, dtype) for x in self._sines())
         sines = jnp.sin(frequency[:, None] * (view_zenith[..., None, :] + BEFORE))
         return jnp.einsum("bs,...sv->...bv", mixing, sines)
 
     def _sines(self) -> tuple[np.ndarray, np.ndarray]:
-        """Frequencies (sine,), and their coefficients in each function (basis, sine)."""
+        """Return frequencies (sine,) and coefficients in each function (basis, sine)."""
         frequency = math.pi * np.arange(1, self.basis + 2) / SPAN
         scale = np.exp(-((self.length * frequency) ** 2) / 4.0)
         # A reflection that takes the values at 0 to the first axis: the others vanish there.

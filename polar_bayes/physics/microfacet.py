@@ -1,4 +1,4 @@
-"""How facets tilt: distributions of slopes, their shadowing, and where to sample them.
+"""Microfacet distributions: slopes, shadowing, and nodes for quadrature.
 
 Write a new distribution by giving the four methods of `AbstractMicrofacet`; every rough surface
 then works with it. `density` and `shadowing` serve a point source, `across` and `along` (the two
@@ -61,7 +61,7 @@ class AbstractMicrofacet(Part):
 
     @abc.abstractmethod
     def across(self, limit: Array, roughness: Array, share: Array) -> tuple[Array, Array]:
-        """Slopes across the plane of the viewer, between 0 and a limit.
+        """Nodes and weights of slopes across the plane of the viewer, from 0 to a limit.
 
         Args:
             limit: Largest slope. Any shape, 1, > 0.
@@ -77,7 +77,7 @@ class AbstractMicrofacet(Part):
     def along(
         self, lower: Array, upper: Array, across: Array, roughness: Array, share: Array
     ) -> tuple[Array, Array]:
-        """Slopes in the plane of the viewer, between two limits, for a given slope across it.
+        """Nodes and weights of slopes in the viewer's plane, given a slope across it.
 
         Args:
             lower: Smallest slope. Any shape, 1.
@@ -93,7 +93,7 @@ class AbstractMicrofacet(Part):
     def along_whole(
         self, lower: Array, upper: Array, across: Array, roughness: Array
     ) -> Array | None:
-        """What the weights of `along` should sum to, or None where a few nodes come close enough.
+        """Exact sum of the weights of `along`; None where few nodes are accurate enough.
 
         Args:
             lower: As in `along`, and so are the others.
@@ -232,7 +232,7 @@ def _quarter(slope: Array, width: Array) -> Array:
 
 
 def _fourfold(quarter: Array) -> tuple[Array, Array]:
-    """Tangent of the angle with that tangent of its quarter, and the angle's derivative by it."""
+    """Tangent of four times an angle with this tangent, and the angle's derivative by it."""
     half = 2.0 * quarter / (1.0 - quarter**2)
     # Slopes far out on one side have no weight, but must be finite: rounding may reach 90 degrees.
     furthest = 1.0 - jnp.finfo(half.dtype).eps
@@ -244,7 +244,7 @@ def _fourfold(quarter: Array) -> tuple[Array, Array]:
 
 
 class Axes(NamedTuple):
-    """The axes of an ellipse of slopes: along grooves that are steep across.
+    """Axes of an ellipse of slopes: along grooves, whose slopes across are steep.
 
     Args:
         gentle: Roughness of slopes along the axis of the gentler slopes. Shape (..., view), 1.
@@ -260,7 +260,7 @@ class Axes(NamedTuple):
 
 
 class SlopeEllipse(NamedTuple):
-    """Slopes seen by one viewer: x towards it, y across.
+    """Slopes in the frame of one viewer: x towards it, y across.
 
     With u and w isotropic of roughness 1: y = across w and x = along u + shear w.
 
@@ -280,7 +280,7 @@ class SlopeEllipse(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class AbstractSlopes(Part):
-    """The roughness of a surface, direction by direction.
+    """Roughness of a surface as a function of direction.
 
     Args:
         turned: Whether it changes with azimuth.
@@ -300,7 +300,7 @@ class AbstractSlopes(Part):
 
 @dataclasses.dataclass(frozen=True)
 class IsotropicSlopes(AbstractSlopes):
-    """The same roughness all around."""
+    """Equal roughness in all directions."""
 
     parameters: ClassVar[tuple[str, ...]] = ("roughness",)
     turned: ClassVar[bool] = False
@@ -365,11 +365,11 @@ class AnisotropicSlopes(AbstractSlopes):
 
 @dataclasses.dataclass(frozen=True)
 class AbstractShadowing(Part):
-    """How two directions, each with its own share G1 of visible facets, combine."""
+    """Joint visibility of two directions, given the share G1 of facets that see each."""
 
     @abc.abstractmethod
     def both(self, view: Array, light: Array) -> Array:
-        """Share of facets that see viewer and light.
+        """Share of facets that see both viewer and light.
 
         Args:
             view: G1 of the viewer. Any shape, 1, in (0, 1].
@@ -380,7 +380,7 @@ class AbstractShadowing(Part):
         """
 
     def twice(self, view: Array, ray: Array, light: Array, rises: Array) -> Array:
-        """Share of pairs of facets that viewer and light see, and that see each other.
+        """Share of pairs of facets that see each other, one the viewer, one the light.
 
         Args:
             view: G1 of the viewer. Any shape, 1, in (0, 1].
@@ -398,7 +398,7 @@ class AbstractShadowing(Part):
 
 @dataclasses.dataclass(frozen=True)
 class SeparableShadowing(AbstractShadowing):
-    """Viewer and light as if independent: G = G1(v) G1(l).
+    """Independent visibility of viewer and light: G = G1(v) G1(l).
 
     Source:
         Walter et al. 2007, Microfacet models for refraction through rough surfaces.
@@ -411,7 +411,7 @@ class SeparableShadowing(AbstractShadowing):
 
 @dataclasses.dataclass(frozen=True)
 class HeightCorrelatedShadowing(AbstractShadowing):
-    r"""A high facet is seen by both, a deep one by neither.
+    r"""Visibility correlated by height: high facets see both, deep facets neither.
 
     $$ G = \frac{1}{1 + \Lambda_v + \Lambda_l}, \qquad \Lambda = 1/G_1 - 1 $$
 
@@ -441,7 +441,7 @@ class HeightCorrelatedShadowing(AbstractShadowing):
 
 @dataclasses.dataclass(frozen=True)
 class NoShadowing(AbstractShadowing):
-    """Every facet is seen and lit: brighter towards grazing than any surface can be."""
+    """No shadowing: brighter towards grazing than any real surface."""
 
     @override
     def both(self, view: Array, light: Array) -> Array:

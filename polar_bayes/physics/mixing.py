@@ -1,4 +1,4 @@
-"""How light from the surface and light from the body add up to what is seen."""
+"""Mixing rules: how light from the surface and light from the body add up."""
 
 import abc
 import dataclasses
@@ -78,12 +78,12 @@ class StokesMixing(AbstractMixing):
 
 
 def _blend(fraction: Array, first: Array, second: Array) -> Array:
-    """First and second, weighted."""
+    """Weighted mean of two values."""
     return (1.0 - fraction) * first + fraction * second
 
 
 def _share(fraction: Array, surface: Array, subsurface: Array) -> Array:
-    """Share of the body in the brightness, defined where all light vanishes."""
+    """Share of the body in the brightness, finite where all light vanishes."""
     # Far from the mirror direction a smooth surface sends no light at all; at a fraction of 0 the
     # share is then 0/0, and its slope is the ratio of the two intensities. A trace of the other
     # part, eps^1.25, keeps value, gradient and Hessian finite; it moves the share by at most

@@ -1,4 +1,4 @@
-"""What all parts of a scene share: the parameters they read, and what to put in their place.
+"""Parts of a scene: the base class, settings, names and ranges of parameters.
 
 A part is a frozen value. A part that can be replaced by something cheaper says so in `simpler`;
 that is all the ledger of effects needs to weigh it (`polar_bayes.choose_effects`). A part that
@@ -20,15 +20,15 @@ from polar_bayes.errors import SceneError
 from polar_bayes.repr_html import HTMLRepr
 
 Setting = float | str
-"""A known number, or the name of a parameter that stands for it."""
+"""A known number, or the name of a parameter that supplies it."""
 
 
 Parameters = Mapping[str, Array]
-"""Parameters by name, each of which broadcasts with (..., view)."""
+"""Parameters by name; each broadcasts with (..., view)."""
 
 
 class Range(NamedTuple):
-    """Range of the numbers of a field: `absorbance: Annotated[Setting, Range(0.0, 100.0)]`."""
+    """Range of a field: `absorbance: Annotated[Setting, Range(0.0, 100.0)]`."""
 
     low: float
     high: float
@@ -36,10 +36,10 @@ class Range(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Part(HTMLRepr, abc.ABC):
-    """One effect of a scene."""
+    """A part of a scene, which describes one effect."""
 
     defines: ClassVar[tuple[str, ...]] = ()
-    """Parameters whose values mean something else where another part stands in its place."""
+    """Parameters whose meaning depends on this part."""
 
     def __post_init__(self) -> None:
         for name, allowed, value in self._values():
@@ -48,7 +48,7 @@ class Part(HTMLRepr, abc.ABC):
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters that it reads: those of its settings and of its parts."""
+        """Names of the parameters that the part reads, by its settings and its parts."""
         names: list[str] = []
         for _, allowed, value in self._values():
             if isinstance(value, Part):
@@ -58,7 +58,7 @@ class Part(HTMLRepr, abc.ABC):
         return tuple(dict.fromkeys(names))
 
     def _values(self) -> Iterator[tuple[str, Range | None, object]]:
-        """Every field with its range and its value, or each value of its tuple."""
+        """Yield every field with its range and value, or each value of a tuple."""
         for field in dataclasses.fields(self):
             notes = getattr(field.type, "__metadata__", ())
             allowed = next((note for note in notes if isinstance(note, Range)), None)
@@ -70,7 +70,7 @@ class Part(HTMLRepr, abc.ABC):
                 yield field.name, allowed, one
 
     def simpler(self) -> "tuple[Part | None, ...]":
-        """What may stand in its place: a cheaper part, or None for leaving it out.
+        """Return simpler replacements: cheaper parts, or None to leave the part out.
 
         Returns:
             Replacements to be judged, each alone; empty where there is nothing simpler.
@@ -78,7 +78,7 @@ class Part(HTMLRepr, abc.ABC):
         return ()
 
     def alternatives(self) -> "tuple[Part, ...]":
-        """What could be there as well: parts that the readings may not tell from this one.
+        """Return parts that could replace this one, and that readings may not distinguish.
 
         Returns:
             Parts that every fit compares with this one, each alone; empty where there are none.
@@ -87,20 +87,20 @@ class Part(HTMLRepr, abc.ABC):
 
 
 def value_of(setting: Setting, parameters: Parameters) -> Array:
-    """The number of a setting in the parameters' precision, or the parameter that it names."""
+    """Return a setting's number in the parameters' precision, or the parameter it names."""
     if isinstance(setting, str):
         return parameters[setting]
     return jnp.asarray(setting, jnp.result_type(float, *parameters.values()))
 
 
 def parameters_of(*parts: Any) -> tuple[str, ...]:
-    """The parameters that several parts read, each once; a part may be None."""
+    """Return the parameters that several parts read, each once; parts may be None."""
     names = (name for part in parts if part is not None for name in part.parameters)
     return tuple(dict.fromkeys(names))
 
 
 def check_part(value: object, where: str, kind: type | UnionType, allowed: str) -> None:
-    """Refuse a part of the wrong kind, naming the right ones."""
+    """Refuse a part of a wrong kind, and name the right kinds."""
     if not isinstance(value, kind):
         raise SceneError(f"{value!r} is no such part", where=where, hint=f"give {allowed}")
 
@@ -123,18 +123,18 @@ def unit_rule(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def squared_rule(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The same in the square root: denser at 0, where light meets an interface at grazing."""
+    """Nodes and weights on (0, 1) that are denser at 0, where light is at grazing."""
     node, weight = unit_rule(count)
     return node**2, 2.0 * node * weight
 
 
 def at_least(value: Array, floor: float) -> Array:
-    """The larger of both; at the floor itself the slope is that from above, not half of it."""
+    """Return the larger of two values; the slope at the floor is that from above."""
     return jnp.where(value < floor, floor, value)
 
 
 def quotient(numerator: Array, denominator: Array) -> Array:
-    """A quotient that single precision can derive twice, however small the denominator."""
+    """Return a quotient whose second derivatives are finite in single precision."""
     # The Hessian divides by the denominator's cube, which for light of 1e-13 does not exist there.
     # A factor, since XLA would turn two quotients into one of products.
     scale = 1.0 / jax.lax.stop_gradient(denominator)
@@ -142,7 +142,7 @@ def quotient(numerator: Array, denominator: Array) -> Array:
 
 
 def like(values: ArrayLike, array: Array) -> Array:
-    """Constants in the precision of the data."""
+    """Convert constants to the precision of the data."""
     return jnp.asarray(values, jnp.result_type(float, array))
 
 
@@ -150,7 +150,7 @@ def like(values: ArrayLike, array: Array) -> Array:
 
 
 class Quantity(NamedTuple):
-    """How a parameter is written.
+    """Notation of a parameter: symbol, meaning and unit.
 
     Args:
         symbol: The paper's or the field's letter; empty where there is none.
@@ -185,7 +185,7 @@ MATERIAL: dict[str, Quantity] = {
     "normal_tilt_x": Quantity("", "lean of the normal towards azimuth 0", "degree"),
     "normal_tilt_y": Quantity("", "lean of the normal towards azimuth 90", "degree"),
 }
-"""Of a material, in the order in which they are listed; the others belong to a whole capture."""
+"""Parameters of a material, in the order of tables; all others belong to a whole capture."""
 
 NOTATION: dict[str, Quantity] = {
     **MATERIAL,
@@ -223,7 +223,7 @@ NOTATION: dict[str, Quantity] = {
 
 
 class Absence(NamedTuple):
-    """Where what a parameter describes is absent or perfect.
+    """Values at which what a parameter describes is absent or perfect.
 
     Args:
         value: Of the parameter, an end of its range.
@@ -246,15 +246,15 @@ ABSENT: dict[str, Absence] = {
     "dolp_gain": Absence(1.0, "no loss of polarization in the polarizer"),
     "discrepancy_amplitude": Absence(0.0, "no smooth error over angle"),
 }
-"""The simplest world: a bare and smooth surface, and an instrument without faults."""
+"""Absence by parameter: a bare and smooth surface, and an instrument without faults."""
 
 
 UNPOLARIZED = ("leakage", "subsurface_fraction")
-"""Shares of the light that lose their polarization: readings determine their sum first."""
+"""Shares of light that lose their polarization, whose sum readings determine best."""
 
 
 def notation(name: str) -> Quantity:
-    """The row of a parameter, or of its population, or one made of its name."""
+    """Return the notation of a parameter, or of its population, or one made from its name."""
     population = {"_location": "population median of", "_spread": "population spread of"}
     for ending, words in population.items():
         if name.endswith(ending) and name.removesuffix(ending) in NOTATION:
@@ -264,5 +264,5 @@ def notation(name: str) -> Quantity:
 
 
 def absence(name: str) -> Absence | None:
-    """Where what a parameter, or the location of its population, describes is absent, if it can."""
+    """Return the absence of a parameter, or of its population's location; None without any."""
     return ABSENT.get(name.removesuffix("_location"))

@@ -1,4 +1,4 @@
-r"""How a body scatters, and how bright a half space of it is, without polarization.
+r"""Phase functions of bodies, and the brightness of a half space without polarization.
 
 The brightness is the radiance inside over that of a white diffuser,
 
@@ -54,7 +54,7 @@ AZIMUTHS = (22.5, 67.5, 112.5, 157.5)
 
 
 def _forward_turns(count: int, narrowed: float) -> Turns:
-    """Azimuths from the viewer's, the denser the nearer to the mirror side, and their shares."""
+    """Azimuths from the viewer's, denser near the mirror side, and their weights."""
     # Equal steps of an angle t where tan(turn/2) = narrowed tan(t/2), turn from the mirror side.
     t = (np.arange(count) + 0.5) * np.pi / count - 0.5 * np.pi
     share = narrowed / (np.cos(t) ** 2 + (narrowed * np.sin(t)) ** 2) / count
@@ -76,7 +76,7 @@ class AbstractPhaseFunction(Part):
     def reflectance(
         self, parameters: Parameters, light: Ray, view: Ray, azimuth: Array, escape: Array
     ) -> Array:
-        """Radiance inside, over that of a white diffuser, of a half space that scatters so.
+        """Radiance inside of a half space, over that of a white diffuser.
 
         Args:
             parameters: `absorption`, `refractive_index` and those of this part; they broadcast
@@ -93,7 +93,7 @@ class AbstractPhaseFunction(Part):
 
 @dataclasses.dataclass(frozen=True)
 class Isotropic(AbstractPhaseFunction):
-    """Light is scattered into all directions alike."""
+    """Isotropic scattering: equal in all directions."""
 
     @override
     def reflectance(
@@ -118,7 +118,7 @@ class Isotropic(AbstractPhaseFunction):
 
 @dataclasses.dataclass(frozen=True)
 class HenyeyGreenstein(AbstractPhaseFunction):
-    r"""Light is scattered forwards for the most part, as by particles that are not small.
+    r"""Henyey-Greenstein scattering, mostly forward, as by particles that are not small.
 
     $$ p = \frac{1 - g^2}{(1 + g^2 - 2 g \cos\Theta)^{3/2}} $$
 
@@ -168,7 +168,7 @@ class HenyeyGreenstein(AbstractPhaseFunction):
         )
 
         def mean(one: _Direction, other: _Direction, azimuths: Sequence[ArrayLike]) -> Array:
-            """Of r over azimuths from the mirror side."""
+            """Return the mean of r over azimuths from the mirror side."""
             sines = one.sine * other.sine
             pair = one.basis[..., :, None] * other.basis[..., None, :]
             orders = [
@@ -194,7 +194,7 @@ class HenyeyGreenstein(AbstractPhaseFunction):
 
 
 class _Direction(NamedTuple):
-    """A direction inside the body, with H and the polynomials of its cosine, on a last axis."""
+    """A direction inside the body, with H and polynomials of its cosine on a last axis."""
 
     cosine: Array
     sine: Array
@@ -216,7 +216,7 @@ def _table() -> np.ndarray:
 
 
 def _of_orders(g: Array, gamma: Array) -> list[Array]:
-    """Of each P_m, coefficients of the polynomials of both cosines, on two last axes."""
+    """Coefficients of the polynomials of both cosines, of each P_m, on two last axes."""
     share = g / MOST_ANISOTROPY
     of_g, of_gamma = _chebyshev(share), _chebyshev(gamma)
     # That of order 0 vanishes with g, where scattering is isotropic.
@@ -237,14 +237,14 @@ def _chebyshev(share: Array) -> Array:
 
 
 def _mean_cosine(refractive_index: Array, escape: Array) -> Array:
-    """Of light that the interface turns back."""
+    """Mean cosine of light that the interface reflects back."""
     critical = critical_cosine_squared(refractive_index)
     beyond = critical / jnp.maximum(1.0 - escape, critical)
     return 2.0 / 3.0 * (1.0 - (1.0 - jnp.sqrt(critical)) * beyond)
 
 
 def _isotropic_h(cosine: Array, g: Array) -> tuple[Array, Array]:
-    """Numerator and denominator of H."""
+    """Numerator and denominator of H of isotropic scattering."""
     # A fit to H by iteration on 200 nodes, within .25 % of H and of the plane albedo 1 - g H, for g
     # up to .99 and cosines from .003. Exact for a black body (g = 1) and at grazing: H = 1.
     level = 1.9613 + g * (0.4670 - 0.1275 * g)

@@ -47,7 +47,7 @@ MATERIAL_PARAMETERS = tuple(MATERIAL)
 
 @dataclasses.dataclass(frozen=True)
 class Scene(HTMLRepr):
-    """Parts that are there act; parts that are None are absent from the compiled program.
+    """Optics and instrument as parts; parts that are None are absent from compiled programs.
 
     Args:
         surface: SmoothSurface() or RoughSurface(...).
@@ -74,7 +74,7 @@ class Scene(HTMLRepr):
     normal: TiltedNormal | None = None
 
     ledger: ClassVar[object | None] = None
-    """What is known of how the scene was chosen; see `polar_bayes.choose_effects`."""
+    """Record of how the scene was chosen; see `polar_bayes.choose_effects`."""
 
     def __post_init__(self) -> None:
         check_part(self.surface, "surface", AbstractSurface, "SmoothSurface() or RoughSurface()")
@@ -104,7 +104,7 @@ class Scene(HTMLRepr):
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters that the scene reads: the material's, then all others."""
+        """Names of the parameters that the scene reads: the material's first."""
         index = ("refractive_index",) if self.dispersion is None else self.dispersion.parameters
         optics = parameters_of(self.surface, self.subsurface, self.mixing)
         rest = parameters_of(self.coat, self.normal, self.instrument)
@@ -114,12 +114,12 @@ class Scene(HTMLRepr):
 
     @property
     def terms(self) -> tuple[AbstractInstrumentTerm, ...]:
-        """Terms of the instrument; none of a perfect one."""
+        """Terms of the instrument; empty for a perfect one."""
         return () if self.instrument is None else self.instrument.terms
 
     @property
     def optical_parameters(self) -> tuple[str, ...]:
-        """Those of `parameters` that are not the instrument's."""
+        """Names of the parameters that are not the instrument's."""
         instrument = () if self.instrument is None else self.instrument.parameters
         return tuple(name for name in self.parameters if name not in instrument)
 
@@ -130,7 +130,7 @@ class Scene(HTMLRepr):
         return (Table(columns, rows, prose=columns),)
 
     def light(self, parameters: Mapping[str, ArrayLike], geometry: Geometry) -> Light:
-        """Light that reaches the viewer, before any instrument.
+        """Return the light that reaches the viewer, before any instrument.
 
         Args:
             parameters: Material parameters by name; more than the scene reads may be given.
@@ -147,7 +147,7 @@ class Scene(HTMLRepr):
         return self._optics(per_view, geometry)
 
     def stokes(self, parameters: Mapping[str, ArrayLike], geometry: Geometry) -> Array:
-        """Stokes vector S0, S1, S2 that reaches the viewer, before any instrument.
+        """Return the Stokes vector S0, S1, S2 that reaches the viewer, before any instrument.
 
         Args:
             parameters: Material parameters by name. Shape (...), 1.
@@ -163,7 +163,7 @@ class Scene(HTMLRepr):
         return to_stokes(self.light(parameters, geometry))
 
     def predict(self, parameters: Mapping[str, ArrayLike], geometry: Geometry) -> dict[str, Array]:
-        """Readings as the instrument records them, without noise.
+        """Return readings as the instrument records them, without noise.
 
         Args:
             parameters: Material and instrument parameters by name. Shape (...);
@@ -187,7 +187,7 @@ class Scene(HTMLRepr):
         return {"dop": dop, "q": q, "u": u, "intensity": intensity}
 
     def has(self, term: type[AbstractInstrumentTerm]) -> bool:
-        """Whether the instrument has such a term.
+        """Return whether the instrument has a term of a type.
 
         Args:
             term: Class of the term, such as DarkLevel.
@@ -198,7 +198,7 @@ class Scene(HTMLRepr):
         return any(isinstance(part, term) for part in self.terms)
 
     def without(self, term: type[AbstractInstrumentTerm]) -> "Scene":
-        """The same scene with one instrument term removed.
+        """Return the scene with one instrument term removed.
 
         Args:
             term: Class of the term, such as DarkLevel.
@@ -217,7 +217,7 @@ class Scene(HTMLRepr):
         return self._with_terms(rest)
 
     def known_to(self, quantities: Iterable[AbstractInputQuantity]) -> "Scene":
-        """The same scene with these input quantities of its set-up, but for those it has.
+        """Return the scene with these input quantities added, except those it has.
 
         Args:
             quantities: What the set-up is known to, such as `LightZenith()`.
@@ -231,7 +231,7 @@ class Scene(HTMLRepr):
 
     @property
     def perfectly_known(self) -> "Scene":
-        """The same scene without input quantities."""
+        """The scene without input quantities."""
         others = (x for x in self.terms if not isinstance(x, AbstractInputQuantity))
         return self._with_terms(tuple(others))
 
@@ -239,7 +239,7 @@ class Scene(HTMLRepr):
         return dataclasses.replace(self, instrument=Instrument(terms) if terms else None)
 
     def _optics(self, parameters: Parameters, geometry: Geometry) -> Light:
-        """Light in the stated frame of the viewer, for parameters that have a view axis."""
+        """Return light in the stated frame of the viewer, for parameters with a view axis."""
         geometry = geometry.resolved()
         if self.normal is None:
             return self._material(parameters, geometry)
@@ -247,7 +247,7 @@ class Scene(HTMLRepr):
         return self.normal.leave(self._material(parameters, inside), turn)
 
     def _material(self, parameters: Parameters, geometry: Geometry) -> Light:
-        """Surface, body and their mixture, in directions from the true normal."""
+        """Return surface, body and their mixture, in directions from the true normal."""
         if self.dispersion is not None:
             index = self.dispersion.index(parameters, self._wavelength(geometry))
             parameters = {**parameters, "refractive_index": index}
@@ -275,7 +275,7 @@ class Scene(HTMLRepr):
     def _per_view(
         self, parameters: Mapping[str, ArrayLike], names: tuple[str, ...], geometry: Geometry
     ) -> dict[str, Array]:
-        """The parameters that the scene reads, in one precision, each with a trailing view axis."""
+        """Return the scene's parameters in one precision, each with a trailing view axis."""
         # A Python number takes the precision of the arrays beside it.
         needed = [name for name in self.parameters if name in names]
         # Who does not know of an input quantity, such as a model of the user's own, has none.
@@ -289,11 +289,11 @@ class Scene(HTMLRepr):
 
 
 class UnsuitablePartsError(SceneError):
-    """Two parts do not go together, each of which goes with others."""
+    """Two parts are incompatible, although each is valid with other parts."""
 
 
 def _has_film(coat: AbstractCoat | None) -> bool:
-    """Whether a coat is a thin film, or a stack with one."""
+    """Return whether a coat is a thin film, or a stack that contains one."""
     if isinstance(coat, CoatStack):
         return any(_has_film(each) for each in coat.coats)
     return isinstance(coat, ThinFilm)
@@ -368,4 +368,4 @@ FULL_SCENES: dict[str, Scene] = {
         ),
     ),
 }
-"""The same set-ups with everything on: where `polar_bayes.choose_effects` starts."""
+"""The named scenes with all effects, from which `polar_bayes.choose_effects` starts."""

@@ -1,4 +1,4 @@
-r"""Light that meets two facets of a rough surface, one after the other.
+r"""Light that is reflected by two facets of a rough surface, one after the other.
 
 The first bounce loses what other facets hide (Smith's shadowing). Here such light meets one more
 facet. Seen from the viewer, facet m mirrors the ray v into r, and facet h mirrors the ray -r into
@@ -70,7 +70,7 @@ class Vector(NamedTuple):
         return self.x * other.x + self.y * other.y + self.z * other.z
 
     def length(self) -> Array:
-        """Its length, with a finite slope at zero."""
+        """Length, with a finite slope at zero."""
         return jnp.sqrt(jnp.maximum(self.dot(self), LEAST**2))
 
     def cross(self, other: "Vector") -> "Vector":
@@ -82,17 +82,17 @@ class Vector(NamedTuple):
         )
 
     def across(self, other: "Vector") -> "Vector":
-        """Unit vector across both; any one where both are the same direction."""
+        """Unit vector perpendicular to both; any unit vector if both are parallel."""
         product = self.cross(other)
         return product.times(1.0 / jnp.sqrt(product.dot(product) + LEAST**2))
 
     def times(self, factor: Array) -> "Vector":
-        """A multiple."""
+        """Product with a number."""
         return Vector(self.x * factor, self.y * factor, self.z * factor)
 
 
 class _Rays(NamedTuple):
-    """Directions by height over the horizon and azimuth, radian, and their solid angles."""
+    """Directions by height above the horizon and azimuth, radian, and their solid angles."""
 
     height: Array
     azimuth: Array
@@ -100,7 +100,7 @@ class _Rays(NamedTuple):
 
     @property
     def direction(self) -> Vector:
-        """Unit vectors."""
+        """Unit vectors of the directions."""
         around = jnp.cos(self.height)
         x, y = around * jnp.cos(self.azimuth), around * jnp.sin(self.azimuth)
         return Vector(x, y, jnp.sin(self.height))
@@ -125,12 +125,12 @@ class _Lobe(NamedTuple):
 
     @property
     def angle(self) -> Array:
-        """Of the Cauchy distribution, the part from the horizon to the end."""
+        """Angle of the Cauchy distribution from the horizon to the end."""
         square = self.width**2 + self.center * (self.center - self.end)
         return jnp.arctan2(self.end * self.width, square)
 
     def narrowed(self, y: Array) -> Array:
-        """Tangent of half the angle to either side that has half the directions of one y."""
+        """Tangent of the half angle in azimuth that contains half the directions at one y."""
         slope = (self.across * (jnp.sin(y) + jnp.sin(self.center))) ** 2
         half_sum, half_difference = 0.5 * (y + self.center), 0.5 * (y - self.center)
         apart = (2.0 * jnp.sin(half_sum) * jnp.sin(half_difference)) ** 2
@@ -138,19 +138,19 @@ class _Lobe(NamedTuple):
         return jnp.sqrt((slope + apart) / wide + NARROWEST**2)
 
     def everywhere(self) -> "_Lobe":
-        """As many directions on all sides, for facets of all tilts."""
+        """Return a uniform lobe, for facets of all tilts."""
         flat = jnp.full_like(self.width, WIDEST)
         return self._replace(width=flat, across=1e3 * flat)
 
     def nodes(self, share: Array, turn: Array) -> tuple[Array, Array]:
-        """Elevation and azimuth of shares of the directions of each."""
+        """Return elevations and azimuths at quantiles of the directions."""
         sin, cos = jnp.sin(self.angle * share), jnp.cos(self.angle * share)
         y = (self.width**2 + self.center**2) * sin / (self.width * cos + self.center * sin)
         half = jnp.arctan2(self.narrowed(y) * jnp.sin(0.5 * turn), jnp.cos(0.5 * turn))
         return y, self.azimuth + 2.0 * half
 
     def density(self, y: Array, azimuth: Array) -> Array:
-        """Share of the directions per y and per turn in azimuth."""
+        """Return the density of directions in y and azimuth."""
         half, narrowed = 0.5 * (azimuth - self.azimuth), self.narrowed(y)
         around = narrowed / ((narrowed * jnp.cos(half)) ** 2 + jnp.sin(half) ** 2)
         return around * self.width / (self.width**2 + (y - self.center) ** 2) / self.angle
@@ -200,7 +200,7 @@ class TwoBounceSurface(RoughSurface):
         return Light(once.intensity + twice.x, quotient(q, total), quotient(u, total))
 
     def _twice(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Vector:
-        """S0, S1 and S2 of the second bounce."""
+        """Components S0, S1 and S2 of the second bounce."""
         if isinstance(self.illumination, PointSource):
             return self._from_point(parameters, geometry, stack)
         # A sky is many points: (light, ..., view).
@@ -220,7 +220,7 @@ class TwoBounceSurface(RoughSurface):
         return Vector(*(jnp.sum(lights.solid_angle * x, axis=0) for x in each))
 
     def _from_point(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Vector:
-        """The same from a point source of unit irradiance."""
+        """Second bounce of a point source of unit irradiance."""
         facets, stack = self.facets(parameters, geometry).per_facet(), per_facet(stack)
         turn = geometry.light_azimuth - geometry.view_azimuth
         view = per_facet(_towards(geometry.view_zenith, jnp.zeros_like(turn)))
@@ -249,7 +249,7 @@ class TwoBounceSurface(RoughSurface):
         return Vector(*(jnp.sum(share * each, axis=-2) for each in stokes))
 
     def _rays(self, parameters: Parameters, geometry: Geometry) -> _Rays:
-        """From the first facet to the second: (..., ray, view)."""
+        """Rays from the first facet to the second, (..., ray, view)."""
         back = geometry.reversed()
         height, of_light = (
             jnp.deg2rad(90.0 - jnp.abs(each.view_zenith)) for each in (geometry, back)
@@ -280,20 +280,20 @@ def _behind(geometry: Geometry) -> Array:
 
 
 def _seen_share(facets: Microsurface, ray: Vector) -> Array:
-    """G1 of a ray that goes up or down."""
+    """G1 of a ray, upwards or downwards."""
     cosine = jnp.maximum(jnp.abs(ray.z), LEAST)
     return facets.visible(ray.x / cosine, ray.y / cosine)
 
 
 def _density(facets: Microsurface, normal: Vector) -> Array:
-    """Facet area per steradian around a vector of any length; none hangs over."""
+    """Facet area per steradian around a vector of any length; zero for overhanging facets."""
     upright = jnp.maximum(normal.z, LEAST)
     density = facets.density_of(normal.x / upright, normal.y / upright)
     return jnp.where(normal.z > LEAST, density, 0.0)
 
 
 def _mirrored(stack: Stack, facet: Vector, back: Vector, light: Vector, axis: Vector) -> Vector:
-    """Stokes vector of light that facets mirror, in the frame of another one's axis."""
+    """Stokes vector of light that facets mirror, in the frame of another facet's axis."""
     cosine = jnp.clip(0.5 * facet.length(), GRAZING, 1.0)
     power = stack.reflection(cosine, (1.0 - cosine) * (1.0 + cosine))
     own = back.across(light)
@@ -316,12 +316,12 @@ def _lobe(ellipse: SlopeEllipse, end: Array, center: Array, azimuth: Array) -> _
 
 
 def _sides(up: Array, down: Array) -> Array:
-    """Values for directions above and below the horizon, on a new axis in front."""
+    """Stack values for directions above and below the horizon on a new leading axis."""
     return jnp.stack(jnp.broadcast_arrays(up, down))
 
 
 def _nodes(along: int, around: int, lobes: tuple[_Lobe, _Lobe]) -> _Rays:
-    """Directions on a new axis in front; heights count from the horizon as those of lobes do."""
+    """Directions on a new leading axis; heights are measured from the horizon."""
     node, weight = unit_rule(along)
     turn = 2.0 * np.pi * (np.arange(around) + 0.5) / around
     grid = (*np.meshgrid(node, turn, indexing="ij"), np.repeat(weight, turn.size) / turn.size)

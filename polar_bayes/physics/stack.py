@@ -1,4 +1,4 @@
-"""All that lies between air and the body on one facet: bare, or under coats and films.
+"""Layers between air and the body on one facet: bare, or under coats and films.
 
 A coat describes itself by layers (`polar_bayes.physics.coat`); this file stacks them. Thick layers
 add powers, thin ones add fields. Without layers it is one Fresnel boundary and nothing else.
@@ -59,14 +59,14 @@ class Stack(NamedTuple):
     layers: tuple[Layer, ...] = ()
 
     def reflection(self, cos_incidence: Array, sin_squared: Array) -> Diattenuation:
-        """Share of the light that comes back from the whole stack."""
+        """Share of light that the whole stack reflects."""
         if not self.layers:
             air, body = self._bare(cos_incidence)
             return boundary.reflection(air, body, sin_squared)
         return self._respond(cos_incidence, sin_squared)[0]
 
     def relative_reflection(self, cos_incidence: Array, sin_squared: Array) -> Diattenuation:
-        """Reflectance over `scale`: its ratios exist for a body that reflects nothing, too."""
+        """Reflectance over `scale`, so that ratios exist for a body that reflects nothing."""
         if not self.layers:
             air, body = self._bare(cos_incidence)
             return boundary.relative_reflection(air, body, sin_squared)
@@ -76,7 +76,7 @@ class Stack(NamedTuple):
         return power._replace(mean=jnp.maximum(power.mean, trace))
 
     def mirror(self, cos_incidence: Array, sin_squared: Array) -> tuple[Array, Diattenuation]:
-        """Reflectance, mean of s and p, and a reflection in proportion whose size is near 1."""
+        """Mean reflectance of s and p, and reflection up to a factor, of size near 1."""
         if not self.layers:
             air, body = self._bare(cos_incidence)
             mean = boundary.reflection(air, body, sin_squared).mean
@@ -92,7 +92,7 @@ class Stack(NamedTuple):
         return jnp.ones_like(self.refractive_index)
 
     def transmission(self, cos_incidence: Array, sin_squared: Array) -> Diattenuation:
-        """Share of the light that passes the whole stack, the same inwards and outwards."""
+        """Share of light that the whole stack transmits, equal in both directions."""
         if not self.layers:
             air, body = self._bare(cos_incidence)
             return boundary.transmission(air, body, sin_squared)
@@ -111,7 +111,7 @@ class Stack(NamedTuple):
         return jnp.sum(weight * through.mean, axis=-1)
 
     def escape(self) -> Array:
-        r"""Share of diffuse light in the body that the stack does not turn back, 1 - F_i.
+        r"""Share of diffuse light in the body that the stack does not reflect back, 1 - F_i.
 
         $$ 1 - F_i = \frac{1}{n^2}\int_0^{n^2} (1 - R'(B))\, dB $$
 
@@ -128,7 +128,7 @@ class Stack(NamedTuple):
         return lost / self.refractive_index**2
 
     def _absorbed_under_total_reflection(self) -> Array:
-        """Part of that integral over the angles that reach the lowest coat but not the air."""
+        """Part of that integral over angles that reach the lowest coat but not the air."""
         lowest = [layer for layer in self.layers if layer.wavenumber is None][-1]
         end = jnp.minimum(self.refractive_index, lowest.refractive_index) ** 2
         beyond = (end - 1.0)[..., None] * like(TRAPPED_SHARE, self.refractive_index)
@@ -137,11 +137,11 @@ class Stack(NamedTuple):
         return (end - 1.0) * jnp.sum(weight * absorbed, axis=-1)
 
     def _bare(self, cos_incidence: Array) -> tuple[Medium, Medium]:
-        """Air and body."""
+        """Media of a bare interface: air and body."""
         return _air(cos_incidence), boundary.medium(self.refractive_index, cos_incidence**2)
 
     def _hemisphere(self) -> tuple[Array, Array]:
-        """Cosines in air, and weights that average over diffuse light."""
+        """Cosines in air, and weights that average diffuse light over them."""
         has_film = any(layer.wavenumber is not None for layer in self.layers)
         cosine, weight = FRINGE_RULE if has_film else HEMISPHERE_RULE
         index = self.refractive_index
@@ -150,7 +150,7 @@ class Stack(NamedTuple):
     def _respond(
         self, cos_incidence: Array, sin_squared: Array
     ) -> tuple[Diattenuation, Diattenuation]:
-        """Reflectance and transmittance, layer by layer from the body upwards."""
+        """Reflectance and transmittance, computed layer by layer from the body upwards."""
         cos_squared = cos_incidence**2
         sections = self._sections()
         powers = _boundaries(sections, _air(cos_incidence), cos_squared, sin_squared)
@@ -185,7 +185,7 @@ class Stack(NamedTuple):
         return jnp.mean(lost, axis=-1)
 
     def _sections(self) -> list[tuple[tuple[Layer, ...], Layer]]:
-        """Boundaries from the top down: the films on each, and the coat or body below it."""
+        """Boundaries from the top down: films on each, and the coat or body below it."""
         sections: list[tuple[tuple[Layer, ...], Layer]] = []
         films: list[Layer] = []
         for layer in (*self.layers, Layer(self.refractive_index)):
@@ -250,13 +250,13 @@ def _film(layer: Layer, cos_squared: Array) -> Film:
 
 
 def _slant(coat: Layer, cos_squared: Array) -> Array:
-    """Length of the path through a coat, in units of its thickness."""
+    """Path length through a coat, in units of its thickness."""
     inside = boundary.medium(coat.refractive_index, cos_squared)
     return inside.refractive_index / inside.normal
 
 
 def _s_and_p(power: Diattenuation) -> Array:
-    """Both powers, on a new last axis."""
+    """Powers of s and p, on a new last axis."""
     difference = power.contrast * power.sin_squared
     both = jnp.broadcast_arrays(power.mean + difference, power.mean - difference)
     return jnp.stack(both, axis=-1)

@@ -77,7 +77,7 @@ def direction(q: Array, u: Array) -> tuple[Array, Array]:
 
 
 def in_turned_frame(q: Array, u: Array, turn: tuple[Array, Array]) -> tuple[Array, Array]:
-    r"""Components along an s axis that is turned by an angle, towards the second axis.
+    r"""Components along an s axis that is rotated by an angle, towards the second axis.
 
     $$ q' + i u' = (q + i u) e^{-2i\chi} $$
     """
@@ -86,7 +86,7 @@ def in_turned_frame(q: Array, u: Array, turn: tuple[Array, Array]) -> tuple[Arra
 
 
 def diattenuate(light: Light, contrast: Array, balance: Array) -> Light:
-    r"""Light behind a filter that passes 1 + t of s and 1 - t of p (Mueller's diattenuator).
+    r"""Light behind a filter with transmittance 1 + t of s and 1 - t of p (diattenuator).
 
     $$ I' = I (1 + q t), \quad q' = \frac{q+t}{1+qt}, \quad u' = \frac{u\sqrt{1-t^2}}{1+qt} $$
     """
@@ -95,7 +95,7 @@ def diattenuate(light: Light, contrast: Array, balance: Array) -> Light:
 
 
 def polarized_through(passing: Light, q: Array, u: Array) -> Light:
-    r"""Polarized light through a filter that does this to unpolarized light.
+    r"""Polarized light behind a filter, given its effect on unpolarized light.
 
     $$ I' = I (1 + d \cdot s), \qquad (1 + d \cdot s) s' = b s
        + \left(1 + \frac{d \cdot s}{1 + b}\right) d, \qquad b = \sqrt{1-d^2} $$
@@ -121,7 +121,7 @@ def angle_of_linear_polarization(q: Array, u: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class LinearPolarization(Part):
-    """How the light is polarized: its normalized Stokes vector (1, q, u).
+    """Polarization of the light: its normalized Stokes vector (1, q, u).
 
     Args:
         degree: Degree of linear polarization, 1, 0 to 1; a name fits it.

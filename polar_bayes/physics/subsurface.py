@@ -1,4 +1,4 @@
-"""Light that entered the body, was scattered, and leaves through the interface again."""
+"""Subsurface light: it entered the body, was scattered, and leaves through the interface."""
 
 import abc
 import dataclasses
@@ -17,7 +17,7 @@ from polar_bayes.physics.surface import Interface, InternalReflection
 
 @dataclasses.dataclass(frozen=True)
 class AbstractSubsurface(Part):
-    """A body that scatters. Parameters broadcast with (..., view)."""
+    """A scattering body. Parameters broadcast with (..., view)."""
 
     @abc.abstractmethod
     def light(self, parameters: Parameters, geometry: Geometry, interface: Interface) -> Light:
@@ -35,7 +35,7 @@ class AbstractSubsurface(Part):
 
 @dataclasses.dataclass(frozen=True)
 class DiffuseBody(AbstractSubsurface):
-    r"""A body that sends back a share of the light, alike in all directions.
+    r"""A body that returns a share of the light, equally in all directions.
 
     $$ S_0 = \frac{A}{\pi} \cos\theta_l T_+(l) T_+(v), \qquad \text{with internal reflection }
        S_0 = \frac{A}{\pi n^2 (1 - A F_i)} \cos\theta_l T_+(l) T_+(v) $$
@@ -56,7 +56,7 @@ class DiffuseBody(AbstractSubsurface):
     def diffuse(
         self, parameters: Parameters, geometry: Geometry, interface: Interface
     ) -> tuple[Array, Light]:
-        """Brightness inside, and what the way out does to it."""
+        """Brightness inside, and the effect of the interface on light that leaves."""
         albedo = value_of(self.albedo, parameters)
         entering = interface.entering(parameters, geometry).intensity
         brightness = albedo / jnp.pi * entering
@@ -85,7 +85,7 @@ class Unpolarized(DiffuseBody):
 
 @dataclasses.dataclass(frozen=True)
 class Lambertian(DiffuseBody):
-    r"""A diffuse body whose light is polarized only on its way out.
+    r"""A diffuse body whose light is polarized only by the interface on its way out.
 
     $$ S = \frac{A}{\pi} \cos\theta_l T_+(l) [T_+(v), T_-(v), 0] $$
 
@@ -111,7 +111,7 @@ class Lambertian(DiffuseBody):
 
 @dataclasses.dataclass(frozen=True)
 class Depolarizer(AbstractSubsurface):
-    r"""A body that depolarizes the more, the brighter it is (Umov's effect).
+    r"""A body that depolarizes light more, the brighter it is (Umov's effect).
 
     $$ \rho = (1 - R_b(a, n)) \rho_\text{exit}(v; n, r), \qquad
        S_0 = \text{entering} \frac{R(l, v; a, n)}{\pi n^2} T_\text{exit}(v) $$
@@ -191,7 +191,7 @@ def body_loss(absorption: Array, escape: Array | float) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class TurbidMedium(AbstractSubsurface):
-    r"""A half space that scatters: a share by Rayleigh's law, the rest without polarization.
+    r"""A scattering half space: a share scatters by Rayleigh's law, the rest without polarization.
 
     All orders of scattering and of internal reflection (`polar_bayes.physics.half_space`); with E0
     and E1 of the way out, smooth or rough,

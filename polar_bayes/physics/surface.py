@@ -1,4 +1,4 @@
-"""The interface of a material: what it reflects, what it lets in, and what it lets out."""
+"""The interface of a material: reflection, transmission into the body, and out of it."""
 
 import abc
 import dataclasses
@@ -55,7 +55,7 @@ HEMISPHERE_NODES, GROOVE_AZIMUTHS = 8, 4
 
 @dataclasses.dataclass(frozen=True)
 class AbstractExit(Part):
-    """How unpolarized light passes from the body to the viewer.
+    """Passage of unpolarized light from the body to the viewer.
 
     Args:
         both_ways: Whether light enters the body as it leaves it, or as through a plane.
@@ -65,7 +65,7 @@ class AbstractExit(Part):
 
     @abc.abstractmethod
     def light(self, facets: Microsurface, stack: Stack, geometry: Geometry) -> Light:
-        """Transmittance towards the viewer, and the polarization that it gives.
+        """Transmittance towards the viewer, and the polarization that results.
 
         Args:
             facets: How they tilt in the frame of each viewer, which are seen, and how many stand
@@ -80,7 +80,7 @@ class AbstractExit(Part):
 
 @dataclasses.dataclass(frozen=True)
 class SmoothExit(AbstractExit):
-    """Through a plane, whatever the roughness."""
+    """Passage through a plane, at any roughness."""
 
     @override
     def light(self, facets: Microsurface, stack: Stack, geometry: Geometry) -> Light:
@@ -89,7 +89,7 @@ class SmoothExit(AbstractExit):
 
 @dataclasses.dataclass(frozen=True)
 class RoughExit(AbstractExit):
-    r"""Through the facets that the viewer sees.
+    r"""Passage through the facets that the viewer sees.
 
     $$ E_0 = \sum_i w_i T_+, \qquad E_1 = -\sum_i w_i K \sin^2\theta_i \cos 2\psi_i $$
 
@@ -117,7 +117,7 @@ class RoughExit(AbstractExit):
 
 @dataclasses.dataclass(frozen=True)
 class RoughPassage(RoughExit):
-    r"""Through facets on the way in, on the way out, and where light is turned back inside.
+    r"""Passage through facets on the way in and out, and reflection back inside.
 
     $$ S_0 = \frac{A \cos\theta_l E_0(l) E_0(v)}{\pi n^2 (1 - A F_i)}, \qquad
        1 - F_i = \frac{1}{n^2} \int_0^1 2\mu E_0(\mu)\, d\mu $$
@@ -134,7 +134,7 @@ class RoughPassage(RoughExit):
 
 
 def exit_through_plane(stack: Stack, geometry: Geometry) -> Light:
-    """Transmittance and polarization of a plane surface; the shapes of `AbstractExit.light`."""
+    """Transmittance and polarization by a plane surface, in shapes of `AbstractExit.light`."""
     cos_view, sin_view = cos_degrees(geometry.view_zenith), sin_degrees(geometry.view_zenith)
     passing = stack.transmission(cos_view, sin_view**2)
     q = quotient(passing.contrast * sin_view**2, passing.mean)
@@ -174,7 +174,7 @@ class AbstractSurface(Part):
     def beams(
         self, parameters: Parameters, geometry: Geometry, stack: Stack, around: Turns = FOUR_TURNS
     ) -> Beams:
-        """The same light ray by ray, for a body that asks where it comes from.
+        """Light that passes into the body ray by ray, for bodies that depend on its direction.
 
         Args:
             parameters: As in all methods, and so are geometry and stack.
@@ -188,21 +188,21 @@ class AbstractSurface(Part):
 
     @abc.abstractmethod
     def exit(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Light:
-        """What the interface does to unpolarized light on its way out to the viewer.
+        """Effect of the interface on unpolarized light on its way out to the viewer.
 
         Returns:
             Light whose intensity is the transmittance; q <= 0, along the plane of the viewer.
         """
 
     def escape(self, parameters: Parameters, geometry: Geometry, stack: Stack) -> Array:
-        """Share of diffuse light in the body that is not turned back, broadcasts with views."""
+        """Share of diffuse light that is not reflected back inside; broadcasts with views."""
         del parameters, geometry
         return stack.escape()
 
 
 @dataclasses.dataclass(frozen=True)
 class SmoothSurface(AbstractSurface):
-    """A Fresnel mirror, seen by a detector that catches the whole reflected beam: S0 = R+.
+    """A Fresnel mirror whose whole reflected beam reaches the detector: S0 = R+.
 
     Light falls in as a beam. The angle of incidence is half the angle between viewer and light.
 
@@ -247,7 +247,7 @@ class SmoothSurface(AbstractSurface):
 
 @dataclasses.dataclass(frozen=True)
 class RoughSurface(AbstractSurface):
-    """Facets that are small mirrors, each hit by light once.
+    """A surface of small mirrors (facets), each of which reflects light once.
 
     Args:
         distribution: How facets tilt, such as Beckmann() or GGX().
@@ -342,7 +342,7 @@ class RoughSurface(AbstractSurface):
 
 @dataclasses.dataclass(frozen=True)
 class Interface:
-    """A surface with all it is made of, as a body under it needs it."""
+    """A surface with its stack, geometry and parameters, as the body below needs it."""
 
     surface: AbstractSurface
     stack: Stack
@@ -354,15 +354,15 @@ class Interface:
     def beams(
         self, parameters: Parameters, geometry: Geometry, around: Turns = FOUR_TURNS
     ) -> Beams:
-        """The same ray by ray; see `AbstractSurface.beams`."""
+        """Light that passes into the body ray by ray; see `AbstractSurface.beams`."""
         return self.surface.beams(parameters, geometry, self.stack, around)
 
     def exit(self, parameters: Parameters, geometry: Geometry) -> Light:
-        """What happens to light on its way out; see `AbstractSurface.exit`."""
+        """Effect of the interface on light that leaves; see `AbstractSurface.exit`."""
         return self.surface.exit(parameters, geometry, self.stack)
 
     def escape(self, parameters: Parameters, geometry: Geometry) -> Array:
-        """Share of diffuse light in the body that is not turned back; see `Stack.escape`."""
+        """Share of diffuse light that is not reflected back inside; see `Stack.escape`."""
         return self.surface.escape(parameters, geometry, self.stack)
 
 
@@ -371,7 +371,7 @@ class Interface:
 
 @dataclasses.dataclass(frozen=True)
 class InternalReflection(Part):
-    r"""Diffuse light under the interface is turned back and scattered again.
+    r"""Diffuse light that the interface reflects back and the body scatters again.
 
     $$ 1 + A F_i + (A F_i)^2 + \dots = \frac{1}{1 - A F_i} $$
 

@@ -1,4 +1,4 @@
-"""Variants of a scene: without some of its effects, or with another part in the place of one.
+"""Variants of a scene: without some effects, or with other parts.
 
 There is no list of effects or of alternatives: every part whose `simpler` or `alternatives` gives
 replacements has them, wherever it is in a scene and whoever wrote it. Layers that nobody sees, a
@@ -18,7 +18,7 @@ from polar_bayes.physics.subsurface import Unpolarized
 from polar_bayes.physics.surface import SmoothSurface
 
 WATER_FILM = ClearCoat(1.333, 0.0)
-"""The film that a clean sample gets by itself: a wet leaf, a puddle, dew on a plate."""
+"""A film of water, as on a wet leaf, a puddle or a plate with dew."""
 
 KeyPath = tuple[str | int, ...]
 """Keys from a scene to a part: names of fields, and indices of tuples."""
@@ -26,7 +26,7 @@ KeyPath = tuple[str | int, ...]
 
 @dataclasses.dataclass(frozen=True)
 class Effect:
-    """One part of a scene, or a place without one, and one replacement, simpler or alternative."""
+    """One part of a scene, or an empty place, and one replacement, simpler or alternative."""
 
     name: str
     key_path: KeyPath
@@ -39,23 +39,23 @@ class Effect:
         return _path(self.key_path)
 
     def apply(self, scene: Scene) -> Scene:
-        """The scene without this effect; see `simplify`."""
+        """Return the scene without this effect; see `simplify`."""
         return simplify(scene, [self])
 
 
 def effects_of(scene: Scene) -> tuple[Effect, ...]:
-    """Every effect of a scene, in the order of its fields."""
+    """List every effect of a scene, in the order of its fields."""
     return _replacements(scene, operator.methodcaller("simpler"))
 
 
 def alternatives_of(scene: Scene, *, has_wavelength: bool = True) -> tuple[Effect, ...]:
-    """Every part of a scene with one that could be there as well, and layers that nobody sees."""
+    """List parts of a scene with their alternatives, and layers that may be unseen."""
     found = _replacements(scene, operator.methodcaller("alternatives"))
     return (*found, *unseen_layers(scene, has_wavelength=has_wavelength))
 
 
 def unseen_layers(scene: Scene, *, has_wavelength: bool) -> tuple[Effect, ...]:
-    """Films on the body and the back of a plate, where a scene has nothing there."""
+    """Return films on the body and the back of a plate, if the scene has none there."""
     found = []
     if scene.coat is None:
         # Of a thick film the outer interface is all that polarization shows: only one whose index
@@ -74,7 +74,7 @@ def unseen_layers(scene: Scene, *, has_wavelength: bool) -> tuple[Effect, ...]:
 def _replacements(
     scene: Scene, offered: Callable[[Part], Iterable[Part | None]]
 ) -> tuple[Effect, ...]:
-    """Every replacement that the parts of a scene offer, in the order of its fields."""
+    """Yield every replacement that the parts of a scene offer, in the order of fields."""
     found: dict[Scene, tuple[KeyPath, Part, Part | None]] = {}
     for key_path, part in parts_of(scene):
         for replacement in offered(part):
@@ -94,7 +94,7 @@ def _replacements(
 
 
 def _applied(effect: Effect, scene: Scene) -> Scene | None:
-    """The scene without an effect; None where it would have parts that do not go together."""
+    """Return the scene without an effect; None if its parts would be incompatible."""
     try:
         return effect.apply(scene)
     except UnsuitablePartsError:
@@ -102,7 +102,7 @@ def _applied(effect: Effect, scene: Scene) -> Scene | None:
 
 
 def simplify(scene: Scene, effects: Iterable[Effect]) -> Scene:
-    """The scene without some of its effects."""
+    """Return the scene without some of its effects."""
     chosen = {effect.key_path: effect for effect in effects}
     parts = {
         field.name: _rebuilt(getattr(scene, field.name), (field.name,), chosen)
@@ -114,7 +114,7 @@ def simplify(scene: Scene, effects: Iterable[Effect]) -> Scene:
 
 
 def find_effects(name: str, effects: Iterable[Effect], where: str) -> tuple[Effect, ...]:
-    """The effects of that name, class of the part or path."""
+    """Return the effects of a name: a class of a part, or a path."""
     effects = tuple(effects)
     found = tuple(effect for effect in effects if effect.name == name) or tuple(
         effect for effect in effects if name in (type(effect.part).__name__, effect.path)
@@ -127,7 +127,7 @@ def find_effects(name: str, effects: Iterable[Effect], where: str) -> tuple[Effe
 
 
 def parts_of(value: object, key_path: KeyPath = ()) -> Iterator[tuple[KeyPath, Part]]:
-    """Every part inside a value, itself included, outermost first, with its key path."""
+    """Yield every part inside a value, itself included, outermost first, with key paths."""
     if isinstance(value, Part):
         yield key_path, value
     for step, inner in _inside(value):
@@ -144,7 +144,7 @@ def _inside(value: object) -> Iterator[tuple[str | int, object]]:
 
 
 def _rebuilt(value: Any, key_path: KeyPath, effects: Mapping[KeyPath, Effect]) -> Any:
-    """The value with replacements put in, outermost first."""
+    """Return the value with replacements, outermost first."""
     effect = effects.get(key_path)
     if effect is not None and value == effect.part:
         value = effect.replacement

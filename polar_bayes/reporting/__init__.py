@@ -1,4 +1,4 @@
-"""The standard report: figures, tables and one self-contained page."""
+"""Reports: figures, tables and self-contained pages."""
 
 from polar_bayes.namespace import attach
 

@@ -1,4 +1,4 @@
-"""The report of an accuracy study: the error of every method against its time."""
+"""Report of an accuracy study: error of every method against time."""
 
 import itertools
 import math
@@ -40,7 +40,7 @@ TIME_LABELS = {
 
 @style.styled
 def plot_accuracy(result: Study, *, times: Sequence[str] | None = None) -> Figure:
-    """Error against time of every method and its variations, with the Pareto front.
+    """Plot error against time of every method and its variations, with the Pareto front.
 
     Args:
         result: What `polar_bayes.accuracy` returns, or one read back from a file.
@@ -84,7 +84,7 @@ def plot_accuracy(result: Study, *, times: Sequence[str] | None = None) -> Figur
 
 
 def front_panel(axes: Axes, study: AccuracyView, time: str) -> None:
-    """One panel of `plot_accuracy`."""
+    """Draw one panel of `plot_accuracy`."""
     table, noise = study.table, study.resolved
     # Logarithmic axes cannot show a time of zero.
     known = table[np.isfinite(table["error"]) & np.isfinite(table[time]) & (table[time] > 0.0)]
@@ -110,12 +110,12 @@ def front_panel(axes: Axes, study: AccuracyView, time: str) -> None:
 
 
 def _assign(names: pd.Series, values: Sequence[str]) -> dict[str, str]:
-    """A color or marker for each distinct name."""
+    """Assign a color or marker to each distinct name."""
     return dict(zip(dict.fromkeys(names), itertools.cycle(values), strict=False))
 
 
 def _name_methods(axes: Axes, known: pd.DataFrame, time: str, colors: dict[str, str]) -> None:
-    """The name of each method next to its point, where it covers no other name or point."""
+    """Write the name of each method next to its point, where there is room."""
     figure = axes.get_figure()
     # In points; sizes of letters are approximate, for labels are placed before they are drawn.
     scale = 72.0 / (figure.dpi if figure is not None else 100.0)
@@ -148,7 +148,7 @@ def _name_methods(axes: Axes, known: pd.DataFrame, time: str, colors: dict[str, 
 
 
 def accuracy_page(result: xr.DataTree) -> page.Page:
-    """The page of an accuracy study."""
+    """Return the page of an accuracy study."""
     study, provenance = accuracy_view(result), provenance_of(result)
     facts = page.make_facts(
         {str(key).replace("_", " "): value for key, value in provenance.items()}
@@ -172,19 +172,19 @@ def accuracy_page(result: xr.DataTree) -> page.Page:
 
 
 def accuracy_card(result: xr.DataTree) -> page.Card:
-    """The card of an accuracy study."""
+    """Return the card of an accuracy study."""
     study = accuracy_view(result)
     sentences = [*accuracy_sentences(study), text.reference_sentence(study)]
     return sentences, study_table(study), not study.doubts
 
 
 def accuracy_picture(study: AccuracyView) -> page.Picture:
-    """Error against time."""
+    """Plot error against time."""
     return page.picture(plot_accuracy(study), "accuracy.figure_front")
 
 
 def study_table(study: AccuracyView) -> Table:
-    """A row for each method and each variation of it."""
+    """Return a table with a row for each method and each variation of it."""
     table = study.table
 
     def error(row: pd.Series) -> str:
@@ -216,7 +216,7 @@ def study_table(study: AccuracyView) -> Table:
 
 
 def error_table(study: AccuracyView) -> Table:
-    """Errors of every parameter by the methods as given."""
+    """Return a table of errors of every parameter by the methods as given."""
     errors = study.errors[study.is_given]
     cells: page.Cells = {str(name): column(name, ".2g") for name in errors.columns}
     return page.make_table("accuracy.error", cells, errors, label="method")

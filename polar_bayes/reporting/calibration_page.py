@@ -1,4 +1,4 @@
-"""The report of a calibration: ranks, coverage, estimates, and the status of its fits."""
+"""Report of a calibration: ranks, coverage, estimates, and status of its fits."""
 
 import enum
 import functools
@@ -47,7 +47,7 @@ MAX_OTHERS = 4
 def calibration_page(
     calibration: xr.DataTree | CalibrationView, comparisons: Mapping[str, xr.DataTree] | None = None
 ) -> page.Page:
-    """The page of a calibration, compared with others of the same layout."""
+    """Return the page of a calibration, compared with others of the same layout."""
     view = calibration_view(calibration)
     tree, table = view.tree, view.table
     provenance = provenance_of(tree)
@@ -107,7 +107,7 @@ def calibration_page(
 
 
 def calibration_card(calibration: xr.DataTree | CalibrationView) -> page.Card:
-    """The card of a calibration."""
+    """Return the card of a calibration."""
     view = calibration_view(calibration)
     _, passed = text.calibration_headline(view.table, None)
     table = rank_table(view.table, figures.parameter_ranks(view))
@@ -115,7 +115,7 @@ def calibration_card(calibration: xr.DataTree | CalibrationView) -> page.Card:
 
 
 def _others(given: Mapping[str, xr.DataTree], method: str) -> dict[str, CalibrationView]:
-    """The calibrations that a page compares with its own, by names on one line."""
+    """Return the other calibrations of a page, with names on one line."""
     where = "report: comparisons"
     others = {one_line(str(name)): each for name, each in given.items()}
     for name, each in others.items():
@@ -137,7 +137,7 @@ def _others(given: Mapping[str, xr.DataTree], method: str) -> dict[str, Calibrat
 def _paged(
     ranks: Sequence[Ranks], draw: Callable[[Sequence[Ranks]], Figure], name: str, **values: Any
 ) -> Iterator[page.Picture]:
-    """A few panels at a time; the first caption says how to read them all."""
+    """Yield figures of a few panels; the first caption explains them all."""
     for at in range(0, len(ranks), MAX_PANELS):
         some = ranks[at : at + MAX_PANELS]
         labels = text.join([each.label for each in some])
@@ -150,7 +150,7 @@ def _paged(
 
 
 def _score_cells() -> page.Cells:
-    """Columns of coverage, ranks, width and score."""
+    """Return columns of coverage, ranks, width and score."""
 
     def held(level: int) -> Callable[[pd.Series], str]:
         def cell(row: pd.Series) -> str:
@@ -169,7 +169,7 @@ def _score_cells() -> page.Cells:
 
 
 def rank_table(table: pd.DataFrame, ranks: Mapping[str, Ranks]) -> Table:
-    """Every parameter: uniform ranks, coverage, width and score."""
+    """Return a table of parameters: uniformity of ranks, coverage, width and score."""
     level = significance_level(table)
     simulations = next(iter(ranks.values())).pit.size
 
@@ -189,7 +189,7 @@ def rank_table(table: pd.DataFrame, ranks: Mapping[str, Ranks]) -> Table:
 
 
 def comparison_table(compared: pd.DataFrame, titles: Mapping[str, str]) -> Table:
-    """Every parameter by every method."""
+    """Return a table of every parameter by every method."""
     method_of_scores = compared.index.get_level_values("method")[0]
     first = one_line(str(method_of_scores))
     level = significance_level(compared.xs(method_of_scores, level="method"))
@@ -256,7 +256,7 @@ def _readings(
 
 
 def _fit_tables(calibration: xr.DataTree, ranks: Mapping[str, Ranks]) -> Iterator[Table]:
-    """Numbers of fits by status and by method."""
+    """Return numbers of fits by status and by method."""
     fits = calibration["fits"].to_dataset()
     answered = np.all([np.isfinite(each.pit) for each in ranks.values()], axis=0)
     tables: dict[str, tuple[type[enum.IntEnum], Mapping[str, str]]] = {
@@ -278,7 +278,7 @@ def _fit_tables(calibration: xr.DataTree, ranks: Mapping[str, Ranks]) -> Iterato
 
 
 def _fit_facts(calibration: xr.DataTree) -> dict[str, str]:
-    """Effective sample sizes of the fits, and how far they can be trusted."""
+    """Return effective sample sizes and diagnostics of the fits."""
     fits = calibration["fits"].to_dataset()
     facts = {}
     if "ess" in fits:
@@ -297,7 +297,7 @@ def _fit_facts(calibration: xr.DataTree) -> dict[str, str]:
 
 
 def _provenance_facts(provenance: Provenance) -> Iterator[page.Block]:
-    """How the calibration was made, in titled groups of names and values."""
+    """Return the provenance of the calibration in titled groups of names and values."""
     titles = {
         "truth": "What captures were simulated by, where it differs from what is fitted",
         "priors": "Priors",

@@ -1,4 +1,4 @@
-"""The report of several fits of one capture: which predicts best, and where they disagree."""
+"""Report of several fits of one capture: predictive accuracy and differences of intervals."""
 
 from collections.abc import Mapping, Sequence
 
@@ -23,7 +23,7 @@ COLORS = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY, GRAY)
 
 @style.styled
 def plot_comparison(comparison: FitComparison) -> Figure:
-    """Means and 95% intervals of each parameter by every fit that has it.
+    """Plot means and 95% intervals of each parameter by every fit that has it.
 
     Args:
         comparison: Of `polar_bayes.diagnostics.compare_fits`.
@@ -63,7 +63,7 @@ def plot_comparison(comparison: FitComparison) -> Figure:
 
 
 def comparison_page(fits: Mapping[str, xr.DataTree]) -> page.Page:
-    """The page of a comparison."""
+    """Return the page of a comparison."""
     named = {one_line(str(name)): fit for name, fit in fits.items()}
     comparison = compare_fits(named)
     provenances = {name: provenance_of(fit) for name, fit in named.items()}
@@ -79,7 +79,7 @@ def comparison_page(fits: Mapping[str, xr.DataTree]) -> page.Page:
     sections = [
         page.Section("predictions", "Predictions", [*predictions, *page.make_bullets(left_out)]),
         page.Section("parameters", "Parameters", [figure, parameter_table(comparison)]),
-        page.Section("prior", "What the prior said, and what the data", prior, "Prior and data"),
+        page.Section("prior", "Prior and data", prior, "Prior and data"),
         page.Section("settings", "What differs", [settings_table(provenances)]),
     ]
     names = (text.capture_name(each, "") for each in provenances.values())
@@ -98,7 +98,7 @@ def comparison_page(fits: Mapping[str, xr.DataTree]) -> page.Page:
 
 
 def loo_table(comparison: FitComparison) -> Table:
-    """Expected log densities, best first."""
+    """Return a table of expected log densities, best first."""
     cells: page.Cells = {
         "elpd": lambda row: f"{row['elpd']:.1f} ± {or_dash(row['se'], '.1f')}",
         "difference": text.elpd_difference,
@@ -110,7 +110,7 @@ def loo_table(comparison: FitComparison) -> Table:
 
 
 def parameter_table(comparison: FitComparison) -> Table:
-    """Every parameter by every fit."""
+    """Return a table of every parameter by every fit."""
     cells: page.Cells = {
         "fit": page.second_label,
         "mean": lambda row: number(row["mean"], row["sd"]),
@@ -123,7 +123,7 @@ def parameter_table(comparison: FitComparison) -> Table:
 
 
 def sensitivity_table(comparison: FitComparison) -> Table | None:
-    """What the priors did in each fit; None where no fit has draws."""
+    """Return a table of prior sensitivity in each fit; None if no fit has draws."""
     known = comparison.parameters.dropna(subset=["prior_sensitivity"])
     if known.empty:
         return None
@@ -140,7 +140,7 @@ def sensitivity_table(comparison: FitComparison) -> Table | None:
 
 
 def settings_table(provenances: Mapping[str, Provenance]) -> Table:
-    """What the fits were asked for, where it is not the same for all."""
+    """Return a table of the settings in which the fits differ."""
     settings = [_settings(each) for each in provenances.values()]
     rows = []
     for key in dict.fromkeys(key for each in settings for key in each):

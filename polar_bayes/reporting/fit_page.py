@@ -1,4 +1,4 @@
-"""The report of a fit: what it says of the material, and every check of it."""
+"""Report of a fit: results for the material, and every check of the fit."""
 
 import math
 import operator
@@ -45,7 +45,7 @@ from polar_bayes.scenes.sentences import scene_sentences, scene_table
 
 INSTRUMENT_GROUP = "Instrument and noise"
 TRUTH = "true value"
-"""A column that is left out where no true value is known."""
+"""Column that is omitted if no true value is known."""
 
 MAX_POPULATIONS = 6
 PROVENANCE_GROUPS = {
@@ -59,13 +59,13 @@ PROVENANCE_GROUPS = {
     "timings": "Seconds, compilation included",
     "versions": "Versions",
 }
-"""Entries of the provenance, each with the title of its group on the page."""
+"""Entries of the provenance by the title of their group on the page."""
 
 
 def fit_table(
     fit: FitView, key: str, cells: page.Cells, data: pd.DataFrame, **options: Any
 ) -> Table:
-    """A table with a row for each parameter that the numbers have, in groups."""
+    """Return a table with a row for each parameter that has these numbers, in groups."""
     names = set(map(str, fit.posterior.data_vars))
     titles, groups = {}, {}
     for scalar in fit.scalars:
@@ -85,12 +85,12 @@ def fit_table(
 
 
 def has_draws(fit: FitView) -> bool:
-    """Whether the fit has draws of a parameter that move and are finite."""
+    """Return whether a fit has finite draws of a parameter that are not all equal."""
     return fit.method != "point" and bool(plots_fit.drawable(fit))
 
 
 def fit_page(result: xr.DataTree | FitView) -> page.Page:
-    """The page of a fit."""
+    """Return the page of a fit."""
     fit = view_of(result)
     judged = convergence.verdict(fit)
     sentences: list[str] = []
@@ -106,11 +106,11 @@ def fit_page(result: xr.DataTree | FitView) -> page.Page:
         Section("scenes", "Which scene", _scenes(fit.result)),
         Section("population", "Population", _population(fit)),
         Section("spectrum", "Spectrum", _spectrum(fit)),
-        Section("without", "What trusting the instrument would claim", _without(fit), "Instrument"),
-        Section("setup", "What the set-up is known to", _setup(fit), "Set-up"),
+        Section("without", "Without a term for smooth errors", _without(fit), "Instrument"),
+        Section("setup", "Uncertainty budget of the set-up", _setup(fit), "Set-up"),
         Section("readings", "Readings and fit", _readings(fit)),
         Section("pairs", "Material parameters together", _pairs(fit)),
-        Section("prior", "What the prior said, and what the data", _prior(fit), "Prior and data"),
+        Section("prior", "Prior and data", _prior(fit), "Prior and data"),
         Section("convergence", approximation, _convergence(fit), approximation),
         Section(
             "criticism",
@@ -141,7 +141,7 @@ def fit_page(result: xr.DataTree | FitView) -> page.Page:
 
 
 def fit_card(result: xr.DataTree | FitView) -> page.Card:
-    """The card of a fit."""
+    """Return the card of a fit."""
     fit = view_of(result)
     judged = convergence.verdict(fit)
     sentences = [
@@ -157,7 +157,7 @@ def fit_card(result: xr.DataTree | FitView) -> page.Card:
 
 
 def plot_fit(result: xr.DataTree | FitView) -> Figure:
-    """Prior and posterior of a fit, or the readings of a point fit, which has no draws."""
+    """Plot prior and posterior of a fit, or the readings of a point fit, which has no draws."""
     fit = view_of(result)
     if fit.method == "point":
         return plots_curves.plot_readings(fit, plots_curves.variables(fit)[0])
@@ -168,7 +168,7 @@ def plot_fit(result: xr.DataTree | FitView) -> Figure:
 
 
 def parameter_table(fit: FitView) -> Table:
-    """Every parameter with its interval, the truth where known, and what the data determine."""
+    """Return a table of parameters: interval, known truth, and what determines each."""
     if fit.method == "point":
         return _estimate_table(fit)
     cells: page.Cells = {
@@ -207,7 +207,7 @@ def _estimate_table(fit: FitView) -> Table:
 
 
 def sensitivity_table(fit: FitView) -> Table:
-    """Prior against posterior, and how far a changed prior would change the posterior."""
+    """Return a table of prior against posterior, with power-scaling sensitivities."""
     cells: page.Cells = {
         "prior 95%": lambda row: interval(row["prior_q2.5"], row["prior_q97.5"]),
         "posterior 95%": lambda row: interval(row["q2.5"], row["q97.5"]),
@@ -232,7 +232,7 @@ def _prior(fit: FitView) -> Iterator[page.Block]:
 
 
 def _scenes(result: xr.DataTree) -> Iterator[page.Block]:
-    """The scenes that were compared, where the fit has chosen its scene."""
+    """Return blocks on the compared scenes, if the fit has selected its scene."""
     table = scene_table(result)
     if table.empty:
         return
@@ -250,7 +250,7 @@ def _scenes(result: xr.DataTree) -> Iterator[page.Block]:
 
 
 def _criticism(fit: FitView) -> Iterator[page.Block]:
-    """The checks of the model, unless there is nothing to check."""
+    """Return blocks on the checks of the model, unless there is nothing to check."""
     if fit.method == "point":
         return
     cells: page.Cells = {
@@ -272,7 +272,7 @@ def _criticism(fit: FitView) -> Iterator[page.Block]:
 
 
 def _alternatives(fit: FitView) -> Iterator[page.Block]:
-    """What the answer assumes, where a part of the scene has an alternative."""
+    """Return blocks on alternatives to parts of the scene, if there are any."""
     try:
         table = alternatives(fit)
     except FitError:  # the check says why
@@ -295,7 +295,7 @@ def _alternatives(fit: FitView) -> Iterator[page.Block]:
 
 
 def _population(fit: FitView) -> list[page.Block]:
-    """What the members of each population have in common, where anything is pooled."""
+    """Return blocks on populations and their members, if any parameter is pooled."""
     summary, pooled = population_summary(fit), populations(fit)
     if not pooled:
         return []
@@ -316,7 +316,7 @@ def _population(fit: FitView) -> list[page.Block]:
 
 
 def population_table(fit: FitView) -> Table:
-    """Location, spread and the range of a new member, for every pooled parameter."""
+    """Return a table of pooled parameters: location, spread and range of a new member."""
     summary = population_summary(fit)
 
     def with_interval(row: pd.Series, part: str) -> str:
@@ -343,7 +343,7 @@ def population_table(fit: FitView) -> Table:
 
 
 def member_table(fit: FitView) -> Table:
-    """Every member of every population, with and without it."""
+    """Return a table of members of every population, pooled and unpooled."""
     titles = {
         scalar.label: parameter_title(scalar, fit.posterior)
         for each in populations(fit)
@@ -376,7 +376,7 @@ def _spectrum(fit: FitView) -> Iterator[page.Block]:
 
 
 def _without(fit: FitView) -> Iterator[page.Block]:
-    """Each fit without a part of the instrument, compared with the main one."""
+    """Return blocks that compare fits without a part of the instrument with the main fit."""
     if fit.method == "point":
         return
     for at, (key, part) in enumerate(WITHOUT.items(), start=1):
@@ -392,7 +392,7 @@ def _without(fit: FitView) -> Iterator[page.Block]:
 
 
 def discrepancy_table(fit: FitView, compared: pd.DataFrame, part: str, name: str) -> Table:
-    """The fit of the report next to the same fit without a part of the instrument."""
+    """Return a table of the fit next to a fit without a part of the instrument."""
 
     def scale(row: pd.Series) -> float:
         return min(row["q97.5"] - row["q2.5"], row["q97.5_without"] - row["q2.5_without"]) / 4.0
@@ -409,14 +409,14 @@ def discrepancy_table(fit: FitView, compared: pd.DataFrame, part: str, name: str
 
 
 def _setup(fit: FitView) -> Iterator[page.Block]:
-    """Where the uncertainty of the material comes from, as far as the set-up states it."""
+    """Return blocks on the uncertainty budget, if the set-up has input quantities."""
     if has_budget(fit):
         yield budget_table(fit)
         yield from budget_sentences(fit)
 
 
 def budget_table(fit: FitView) -> Table:
-    """Where the variance of each parameter of the material comes from."""
+    """Return a table of variance contributions to each parameter of the material."""
     found = budget(fit)
     data = variance_shares(found).T
     descriptions = {"sd": "of the posterior", "perfect": "in a set-up that is known perfectly"}
@@ -439,7 +439,7 @@ def budget_table(fit: FitView) -> Table:
 
 
 def _glance(fit: FitView) -> page.Picture:
-    """What stands beside the verdict: readings and the fit, small."""
+    """Return small figures of readings and fit, which are shown next to the verdict."""
     quantity = QUANTITIES[plots_curves.variables(fit)[0]]
     figure = plots_curves.readings_at_a_glance(fit)
     return page.picture(figure, "fit.figure_glance", quantity=quantity)
@@ -466,7 +466,7 @@ def _checks(fit: FitView) -> Iterator[page.Block]:
 
 
 def check_table(checks: Mapping[str, PredictiveCheck]) -> Table:
-    """Residuals, coverage, and leave-one-out results of every variable."""
+    """Return a table of residuals, coverage and leave-one-out results of every variable."""
     data = pd.DataFrame.from_dict({n: _check_numbers(x) for n, x in checks.items()}, "index")
     data = data.rename(columns={"standard_error": "elpd_error"})
     cells: dict[str, Callable[[pd.Series], str]] = {
@@ -503,7 +503,7 @@ def _elpd_cell(row: pd.Series) -> str:
 
 
 def _coverage_cell(probability: float) -> Callable[[pd.Series], str]:
-    """Share of the readings in an interval, and how far chance alone moves it."""
+    """Format the share of readings in an interval with its standard error."""
 
     def cell(row: pd.Series) -> str:
         share = row[f"inside_{probability:g}"]
@@ -527,7 +527,7 @@ def _convergence(fit: FitView) -> Iterator[page.Block]:
 
 
 def convergence_table(fit: FitView) -> Table:
-    """R-hat, effective sample sizes and Monte Carlo error of every parameter."""
+    """Return a table of R-hat, effective sample sizes and Monte Carlo errors."""
     cells: page.Cells = {
         "R-hat": column("r_hat", ".4f"),
         "ESS bulk": lambda row: or_dash(np.floor(row["ess_bulk"]), ".0f"),
@@ -539,7 +539,7 @@ def convergence_table(fit: FitView) -> Table:
 
 
 def _sampler_facts(fit: FitView) -> dict[str, object]:
-    """What the sampler or approximation reports of itself."""
+    """Return what the sampler or approximation reports about its run."""
     stats, modes = fit.stats, fit.provenance.get("modes") or {}
     told: Mapping[str, tuple[str, Callable[[xr.DataArray], object]]] = {
         "diverging": ("divergences", lambda x: int(x.sum())),
@@ -571,7 +571,7 @@ def _sampler_facts(fit: FitView) -> dict[str, object]:
 
 
 def _effects(result: xr.DataTree) -> Iterator[page.Block]:
-    """How the scene was chosen, where it was."""
+    """Return blocks on the choice of effects, if there was one."""
     if "effects" not in result.children:
         return
     ledger = result["effects"].to_dataset()
@@ -589,7 +589,7 @@ def _effects(result: xr.DataTree) -> Iterator[page.Block]:
 
 
 def _accuracy(result: xr.DataTree) -> Iterator[page.Block]:
-    """An accuracy study of the same capture, where the result holds one."""
+    """Return blocks on an accuracy study of the capture, if the result holds one."""
     if "accuracy" in result.children:
         study = accuracy_view(result["accuracy"].to_dataset())
         yield " ".join([*accuracy_sentences(study), text.reference_sentence(study)])
@@ -598,7 +598,7 @@ def _accuracy(result: xr.DataTree) -> Iterator[page.Block]:
 
 
 def provenance_facts(provenance: Provenance) -> list[page.Block]:
-    """How the fit was made, in titled groups of names and values; swapped parts are marked."""
+    """Return the provenance in titled groups of names and values; swapped parts are marked."""
     keys = ["method", "settings", "model", "scene", "scene_parts", "seed", "precision"]
     keys += ["chain_method", "step_size_halvings", "largest_view_zenith"]
     fit = {key.replace("_", " "): provenance[key] for key in keys if key in provenance}
@@ -630,7 +630,7 @@ def provenance_facts(provenance: Provenance) -> list[page.Block]:
 
 
 def _counts(counts: Provenance) -> dict[str, Any]:
-    """Numbers of readings that were fitted, masked or set aside."""
+    """Return numbers of readings that were fitted, masked or set aside."""
     found = {"all": counts.get("views"), "fitted": counts.get("used")}
     found |= {"masked (valid=False)": counts.get("masked")}
     if None not in found.values():

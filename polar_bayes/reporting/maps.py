@@ -1,4 +1,4 @@
-"""The report of a map: the status of its pixels, figures, parameters, and coverage where known."""
+"""Report of a map: status of its pixels, figures, parameters, and coverage where known."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -48,7 +48,7 @@ STATUSES = {
 CHECKS = {
     "priors": "medians in the tails of their priors",
     "noise": "scatter above its prior, or three times the stated errors",
-    "residuals": "neighboring views that err alike, an outlier, or all larger than the noise",
+    "residuals": "correlated errors of neighboring views, an outlier, or all above the noise",
     "bounds": "a posterior that lies against a bound",
     "any": "any of these",
 }
@@ -69,7 +69,7 @@ STATUS_COLORS = {
 
 @style.styled
 def plot_maps(maps: xr.Dataset, *, wavelength: float | None = None) -> Figure:
-    """Means, widths of the 95% intervals, Pareto k, method and status of a map.
+    """Plot means, widths of 95% intervals, Pareto k, method and status of a map.
 
     Args:
         maps: Of `polar_bayes.fit_pixels`, or opened from a store.
@@ -114,7 +114,7 @@ def plot_maps(maps: xr.Dataset, *, wavelength: float | None = None) -> Figure:
 
 
 def _pixel_step(maps: xr.Dataset, most: int = 800) -> int:
-    """Of images with more pixels a side every second, third, ... one is drawn."""
+    """Return the step between drawn pixels of a large image."""
     return max(1, -(-max(maps.sizes[dim] for dim in IMAGE) // most))
 
 
@@ -137,7 +137,7 @@ def _draw_values(
     colors: str,
     limits: tuple[float, float] | None = None,
 ) -> None:
-    """One map with its scale; by default one pixel in a hundred lies beyond each end."""
+    """Draw one map with its scale, which excludes one percent of pixels at each end."""
     pixels = values.transpose(*IMAGE).to_numpy().astype(float)
     pixels = np.where(np.isfinite(pixels), pixels, np.nan)
     known = pixels[np.isfinite(pixels)]
@@ -149,7 +149,7 @@ def _draw_values(
 
 
 def _draw_flags(axes: Axes, flags: xr.DataArray, colors: Sequence[str]) -> None:
-    """A map of a few cases, each with a color of its own."""
+    """Draw a map of a few categories with one color each."""
     meanings = flag_meanings(flags)
     count = len(meanings)
     norm = BoundaryNorm(np.arange(count + 1) - 0.5, count)
@@ -174,7 +174,7 @@ def _set_frame(axes: Axes, title: str) -> None:
 
 
 def flag_meanings(flags: xr.DataArray) -> dict[int, str]:
-    """The meaning of each flag as the map itself states it, which holds for older maps as well."""
+    """Return the meaning of each flag from the map, which is correct for older maps, too."""
     words = str(flags.attrs["flag_meanings"]).lower().split()
     meanings = [each.replace("_", " ") for each in words]
     values = np.asarray(flags.attrs.get("flag_values", range(len(meanings))))
@@ -185,7 +185,7 @@ def flag_meanings(flags: xr.DataArray) -> dict[int, str]:
 
 
 def flag_indices(flags: xr.DataArray, meanings: Mapping[int, str]) -> np.ndarray:
-    """The position of each pixel's flag among the known ones, in the order of an image's axes."""
+    """Return the index of each pixel's flag among the known flags, (y, x)."""
     values = flags.transpose(*IMAGE).to_numpy().ravel()
     found = np.full(values.size, -1)
     for index, value in enumerate(meanings):
@@ -197,7 +197,7 @@ def flag_indices(flags: xr.DataArray, meanings: Mapping[int, str]) -> np.ndarray
 
 
 def count_cases(maps: xr.Dataset) -> pd.DataFrame:
-    """Numbers of pixels by status (rows) and method (columns)."""
+    """Count pixels by status (rows) and method (columns)."""
     rows, columns = (flag_meanings(maps[name]) for name in ("status", "method"))
     counts = np.zeros((len(rows), len(columns)), int)
     for place in cut(maps, CHUNK):
@@ -211,11 +211,11 @@ def count_cases(maps: xr.Dataset) -> pd.DataFrame:
 
 TRUST = ("pareto_k", "method", "status")
 UNCHECKED = "laplace"
-"""The method whose draws nothing checks in a map."""
+"""Method of a map whose draws are not checked."""
 
 
 def map_card(result: xr.Dataset) -> page.Card:
-    """The card of a map."""
+    """Return the card of a map."""
     table = parameter_table(result, parameter_titles(map_scalars(result)))
     counts = count_cases(result)
     headline, passed = text.map_headline(counts)
@@ -309,7 +309,7 @@ def map_name(maps: xr.Dataset, truth: xr.Dataset | None = None) -> str:
 
 
 def parameter_titles(scalars: Sequence[Scalar]) -> dict[Scalar, str]:
-    """Every parameter with its symbol, unit and coordinates."""
+    """Return a title with symbol, unit and coordinates for every parameter."""
     titles = {}
     for scalar in scalars:
         symbol, meaning, unit = notation(scalar.name)
@@ -319,7 +319,7 @@ def parameter_titles(scalars: Sequence[Scalar]) -> dict[Scalar, str]:
 
 
 def _pictures(maps: xr.Dataset, scalars: Sequence[Scalar]) -> Iterator[page.Picture]:
-    """Means, widths and trust, a few parameters and one wavelength at a time."""
+    """Yield figures of means, widths and diagnostics, a few parameters each."""
     dims = {scalar.name: set(scalar.index) for scalar in scalars}
     names = [name for name in dims if dims[name] <= {"wavelength"}]
     step = _pixel_step(maps)
@@ -348,7 +348,7 @@ def shown_wavelengths(maps: xr.Dataset) -> list[float]:
 
 
 def _pixel_tables(counts: pd.DataFrame) -> Iterator[Table]:
-    """Pixels by status; and by method, with how many of them are good."""
+    """Return tables of pixels by status, and by method with the share that is good."""
     yield count_table("map.status", counts.sum(axis=1).to_frame("pixels"), STATUSES)
     good = counts.loc["good"] if "good" in counts.index else 0 * counts.sum()
     data = pd.DataFrame({"pixels": counts.sum(), "good": good})
@@ -356,7 +356,7 @@ def _pixel_tables(counts: pd.DataFrame) -> Iterator[Table]:
 
 
 def _criticism_table(maps: xr.Dataset) -> Iterator[Table]:
-    """Pixels by check of the model; none of maps that were not checked."""
+    """Return a table of pixels by check; None for maps without checks."""
     data = count_criticism(maps)
     if not data.empty:
         yield page.make_table(
@@ -370,7 +370,7 @@ def _criticism_table(maps: xr.Dataset) -> Iterator[Table]:
 
 
 def count_table(key: str, data: pd.DataFrame, meanings: Mapping[str, str]) -> Table:
-    """Counts by flag: how many there are, their share, and how many of them fulfil a condition."""
+    """Return a table of counts by flag: number, share, and number that meet a condition."""
     what, *others = map(str, data.columns)
     total = int(data[what].sum())
     cells: page.Cells = {
@@ -385,7 +385,7 @@ def count_table(key: str, data: pd.DataFrame, meanings: Mapping[str, str]) -> Ta
 
 
 def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> Table:
-    """Every parameter over the good pixels: its value, its variation, its uncertainty."""
+    """Return a table over good pixels: value, variation and uncertainty of parameters."""
     data = {}
     for scalar in titles:
         mean, sd, width = (_over_good(maps, scalar, end) for end in ("", "_sd", "_quantile"))
@@ -409,7 +409,7 @@ def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> Table:
 
 
 def shared_table(shared: pd.DataFrame) -> Table:
-    """What all pixels have in common."""
+    """Return a table of the parameters that all pixels share."""
     width = (shared["q97.5"] - shared["q2.5"]) / 4.0
 
     def cell(column: str) -> Callable[[pd.Series], str]:
@@ -432,7 +432,7 @@ def _group(scalar: Scalar) -> str:
 
 
 def _over_good(maps: xr.Dataset, scalar: Scalar, ending: str) -> np.ndarray:
-    """Values of one map over the good pixels, or widths of its 95% intervals: (pixel,)."""
+    """Return values of a map over the good pixels, or widths of its intervals, (pixel,)."""
     values = maps[f"{scalar.name}{ending}"].isel(scalar.index)
     found = []
     for place in cut(maps, CHUNK):
@@ -455,7 +455,7 @@ def _coverage(
     truth: xr.Dataset,
     uncorrected: xr.Dataset | None,
 ) -> tuple[list[str], list[page.Block]]:
-    """Conclusions on the coverage of the maps, and of those that were not corrected; blocks."""
+    """Return conclusions on the coverage of maps, corrected and uncorrected, and blocks."""
     by_label = {scalar.label: title for scalar, title in titles.items()}
     own = map_coverage(maps, truth)
     conclusions, tables = text.coverage_sentences(by_label, own), {"": own}
@@ -471,7 +471,7 @@ def _coverage(
 
 
 def coverage_table(titles: Mapping[Scalar, str], tables: Sequence[pd.DataFrame]) -> Table:
-    """How often the intervals hold the truth, next to those of a map that was not corrected."""
+    """Return a table of coverage, next to that of uncorrected maps."""
     ways = ["holds the truth"] if len(tables) == 1 else ["corrected", "uncorrected"]
     columns = [column for way in ways for column in (way, "within", "of all read")]
     rows = []

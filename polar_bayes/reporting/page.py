@@ -1,4 +1,4 @@
-"""A report page: title, verdict, and sections of sentences, tables and figures.
+"""Report pages: title, verdict, and sections of sentences, tables and figures.
 
 A page is one HTML file without scripts or references to other files. `Page.html` fills the one
 template; `write_page` writes the file, and the result that belongs to it, whole or not at all.
@@ -42,7 +42,7 @@ type Card = tuple[list[str], Table, bool]
 
 
 class Report(NamedTuple):
-    """What is reported of a kind of result: page, card, figure, and the file that is saved with it.
+    """Report of a kind of result: functions of its page, card and figure, and its file.
 
     Options are the arguments of the page besides the result.
     """
@@ -55,7 +55,7 @@ class Report(NamedTuple):
 
 
 def report_of(result: object) -> Report:
-    """What is reported of results of this kind."""
+    """Return the report of a kind of result."""
     kind = kind_of(result)
     if not kind.reports:
         hint = "polar_bayes.summary has its table"
@@ -80,7 +80,7 @@ def make_table(
     prose: Collection[str] = (),
     **values: object,
 ) -> Table:
-    """A table with a row for each row of numbers; `label` heads the column of their names.
+    """Return a table with a row for each row of numbers; `label` heads their names.
 
     The key is that of its caption, which the values fill in; the table is called after it, unless
     it has another name.
@@ -95,7 +95,7 @@ def make_table(
 
 
 def second_label(row: pd.Series) -> str:
-    """The second level of the index, such as the fit in a table of parameters and fits."""
+    """Return the second level of the index, such as the fit in a table of fits."""
     label: Any = row.name
     return one_line(str(label[1]))
 
@@ -104,7 +104,7 @@ def second_label(row: pd.Series) -> str:
 
 
 class Picture(NamedTuple):
-    """A figure as an image that the page itself holds."""
+    """A figure as an image that is embedded in the page."""
 
     source: str
     alternative: str
@@ -151,7 +151,7 @@ type Block = str | Table | Picture | Facts | Heading | Bullets | Link | Details
 
 @dataclasses.dataclass
 class Section:
-    """A part of a page, which the menu calls `link`; one without blocks is left out."""
+    """A section of a page; `link` is its name in the menu. Sections without blocks are omitted."""
 
     id: str
     title: str
@@ -164,7 +164,7 @@ class Section:
 
 @dataclasses.dataclass(frozen=True)
 class Page:
-    """Everything that a page says."""
+    """The content of a page."""
 
     kind: str
     name: str
@@ -211,7 +211,7 @@ def read_template(name: str) -> str:
 
 
 def caption(key: str, **values: object) -> str:
-    """A caption from `templates/captions.toml`, such as `fit.parameter`, with its values."""
+    """Return a caption from `templates/captions.toml`, such as `fit.parameter`, with values."""
     kind, name = key.split(".")
     return str(_captions()[kind][name]).format(**values)
 
@@ -219,7 +219,7 @@ def caption(key: str, **values: object) -> str:
 def picture(
     figure: Figure, key: str, *, instead: str = "", more: str = "", **values: Any
 ) -> Picture:
-    """A figure as a block of a page, with its alternative text and its caption."""
+    """Return a figure as a block of a page, with alternative text and caption."""
     kind, name = key.split(".")
     alternative, caption = (each.format(**values) for each in _captions()[kind][name])
     buffer = io.BytesIO()
@@ -236,7 +236,7 @@ def picture(
 def make_facts(
     values: Mapping[str, Any], title: str = "", *, marked: Collection[str] = (), mark: str = ""
 ) -> list[Block]:
-    """Names and values as a block, `mark` behind those that are marked; none without values."""
+    """Return names and values as a block, marked names followed by `mark`; None if empty."""
     rows = tuple(
         (str(name), _as_text(value), mark if name in marked else "")
         for name, value in values.items()
@@ -245,7 +245,7 @@ def make_facts(
 
 
 def make_bullets(sentences: Iterable[str]) -> list[Block]:
-    """Sentences as a list; none without sentences."""
+    """Return sentences as a list; None if empty."""
     found = tuple(sentences)
     return [Bullets(found)] if found else []
 
@@ -266,7 +266,7 @@ def has_explorer() -> bool:
 def write_page(
     folder: Path, page: str, others: Mapping[str, Callable[[Path], object]] | None = None
 ) -> Path:
-    """Write a page and the files that belong to it; an older report in the folder is replaced."""
+    """Write a page and its files; an older report in the folder is replaced."""
     with write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     is_report = is_page(folder / PAGE)
@@ -290,7 +290,7 @@ def is_page(file: Path) -> bool:
 
 
 def csv_link(table: pd.DataFrame, first: str) -> str:
-    """A table as the address of a link, with no text that a spreadsheet would run."""
+    """Return a table as the address of a link, without text that a spreadsheet would execute."""
     labels = [str(name) for name in table.index.names] if table.index.nlevels > 1 else [first]
     safe = table.reset_index(names=labels, allow_duplicates=True).map(_escape_formula)
     safe.columns = pd.Index([*labels, *(_escape_formula(str(name)) for name in table.columns)])

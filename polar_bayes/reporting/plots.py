@@ -1,4 +1,4 @@
-"""Every figure by its own function, from a saved result alone, and `plot` for any result."""
+"""One function per figure, from a saved result alone, and `plot` for any result."""
 
 from typing import Any
 
@@ -37,7 +37,7 @@ __all__ = [
 
 
 def plot(result: Any) -> Figure:
-    """The main figure of a result.
+    """Plot the main figure of a result.
 
     Args:
         result: A fit, a map, a calibration, an accuracy study, several fits by name, or what

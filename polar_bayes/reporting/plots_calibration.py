@@ -19,11 +19,11 @@ from polar_bayes.reporting.style import BLUE, GRAY, GREEN, ORANGE, PURPLE, SKY, 
 from polar_bayes.reporting.text import or_dash
 
 MAX_INTERVALS = 200
-"""Simulations whose intervals are drawn: more would hide each other."""
+"""Largest number of simulations whose intervals are drawn: more would overlap."""
 
 MAX_ROWS = 6
 METHOD_COLORS = (ORANGE, GREEN, PURPLE, SKY)
-"""Of the methods after the first."""
+"""Colors of the methods after the first."""
 
 RANK = "rank of the truth among the draws (0 lowest, 1 highest)"
 BELOW = "share below, minus rank"
@@ -31,7 +31,7 @@ BELOW = "share below, minus rank"
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Ranks:
-    """Ranks of a parameter, or of a reading, that should be uniform; NaN where a fit failed.
+    """Ranks of a parameter or reading, uniform if calibrated; NaN where a fit failed.
 
     The estimates, shape (4, simulation), are truth, posterior mean and ends of the 80% interval;
     readings have ranks only.
@@ -46,17 +46,17 @@ class Ranks:
 
     @property
     def answered(self) -> np.ndarray:
-        """Ranks of the fits that have an answer."""
+        """Ranks of fits that have an answer."""
         return self.pit[np.isfinite(self.pit)]
 
     @property
     def passes(self) -> bool:
-        """Whether the ranks pass the joint test."""
+        """True if the ranks pass the joint test."""
         return bool(self.row["p_value"] >= self.level)
 
 
 def parameter_ranks(calibration: xr.DataTree | CalibrationView) -> dict[str, Ranks]:
-    """Ranks and estimates of every parameter of a calibration by its label."""
+    """Return ranks and estimates of every parameter of a calibration by its label."""
     calibration = calibration_view(calibration)
     table, tree = calibration.table, calibration.tree
     ranks, marginals = (tree[name].to_dataset() for name in ("prior_sbc", "marginals"))
@@ -82,7 +82,7 @@ def parameter_ranks(calibration: xr.DataTree | CalibrationView) -> dict[str, Ran
 def ecdf_panel(
     axes: Axes, ranks: Ranks, others: Sequence[tuple[Ranks, str]] = (), *, several: bool = False
 ) -> None:
-    """Share of the ranks below each rank, minus the uniform share, in its band."""
+    """Draw the empirical distribution of ranks minus the uniform one, with its band."""
     if ranks.answered.size < 2:
         _too_few(axes)
         return
@@ -102,7 +102,7 @@ def ecdf_panel(
 
 
 def _mark_outside(axes: Axes, ranks: Ranks, band: EcdfBand) -> None:
-    """Dots where the curve leaves the band, which is too narrow to see at its ends."""
+    """Mark points where the curve leaves the band, which is narrow at its ends."""
     at = band.at[1:-1]
     below = np.searchsorted(np.sort(ranks.answered), at, side="left")
     difference = below / ranks.answered.size - at
@@ -113,7 +113,7 @@ def _mark_outside(axes: Axes, ranks: Ranks, band: EcdfBand) -> None:
 
 
 def histogram_panel(axes: Axes, ranks: Ranks) -> None:
-    """Histogram of the ranks, and how high the bars of a uniform one are."""
+    """Draw a histogram of ranks, with the range of bars of a uniform one."""
     count = ranks.answered.size
     if count < 2:
         _too_few(axes)
@@ -135,7 +135,7 @@ def _too_few(axes: Axes) -> None:
 
 
 def estimate_panel(axes: Axes, ranks: Ranks) -> None:
-    """Posterior means and 80% intervals against the truth."""
+    """Draw posterior means and 80% intervals against the truth."""
     last = ranks.estimates.shape[1] - 1
     shown = np.unique(np.linspace(0, last, MAX_INTERVALS).astype(int))
     truth, mean, low, high = ranks.estimates[:, shown]
@@ -176,7 +176,7 @@ def estimate_panel(axes: Axes, ranks: Ranks) -> None:
 def plot_calibration(
     calibration: xr.DataTree | CalibrationView, *, parameters: Sequence[str] | None = None
 ) -> Figure:
-    """Ranks of the truth, their histogram, and estimates against the truth.
+    """Plot ranks of the truth, their histograms, and estimates against the truth.
 
     Args:
         calibration: What `polar_bayes.calibrate` returns, or one read back from a file.
@@ -221,7 +221,7 @@ def plot_calibration(
 def ecdf_differences(
     ranks: Sequence[Ranks], others: Mapping[str, Mapping[str, Ranks]], method: str
 ) -> Figure:
-    """Share of the ranks below each rank, minus the uniform share."""
+    """Plot the empirical distribution of ranks minus the uniform one."""
     colors = _method_colors(others)
 
     def panel(axes: Axes, each: Ranks) -> None:
@@ -236,7 +236,7 @@ def ecdf_differences(
 
 @style.styled
 def rank_histograms(ranks: Sequence[Ranks]) -> Figure:
-    """Histograms of the ranks."""
+    """Plot histograms of the ranks."""
     return _panels(ranks, histogram_panel, (RANK, "density"), 1.5)
 
 
@@ -244,7 +244,7 @@ def rank_histograms(ranks: Sequence[Ranks]) -> Figure:
 def interval_coverage(
     ranks: Sequence[Ranks], others: Mapping[str, Mapping[str, Ranks]], method: str
 ) -> Figure:
-    """How often 50, 80 and 95% intervals hold the truth: a line for each parameter."""
+    """Plot the coverage of 50, 80 and 95% intervals, with a line for each parameter."""
     colors = _method_colors(others)
     height = (0.3 + 0.12 * len(others)) * len(ranks) + 1.0
     figure = style.NotebookFigure(figsize=(8.2, height), layout="constrained")
@@ -274,7 +274,7 @@ def interval_coverage(
 
 @style.styled
 def estimates(ranks: Sequence[Ranks]) -> Figure:
-    """Posterior means with 80% intervals against the truth."""
+    """Plot posterior means with 80% intervals against the truth."""
     figure = _panels(ranks, estimate_panel, ("truth", "mean and 80% interval"), 2.3)
     style.add_legend(figure, columns=4 if figure.get_figwidth() > 6.0 else 2)
     return figure
@@ -287,7 +287,7 @@ def _panels(
     height: float,
     header: float = 0.3,
 ) -> Figure:
-    """A panel for each parameter, all of one size, however few there are."""
+    """Return a figure with one panel per parameter, all of one size."""
     width = {1: 4.4, 2: 6.3}.get(len(ranks), 8.2)
     figure, panels = style.grid(len(ranks), width=width, panel_height=height, header=header)
     for axes, each in zip(panels, ranks, strict=True):

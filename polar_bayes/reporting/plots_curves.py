@@ -26,12 +26,12 @@ COLUMNS = 3
 
 @once
 def variables(fit: FitView) -> list[str]:
-    """The recorded variables of a fit that can be drawn, polarization first."""
+    """Return the recorded variables of a fit that can be drawn, polarization first."""
     return [name for name in QUANTITIES if not _missing(fit.result, name)]
 
 
 def _missing(result: xr.DataTree, name: str) -> str:
-    """What a result lacks to draw the readings of a variable: a path in the tree, or nothing."""
+    """Return the path of what a result lacks for a plot of a variable; empty if nothing."""
     needed = [(group, name) for group in ("observed_data", "noise_free", "posterior_predictive")]
     needed += [("constant_data", each) for each in (*ANGLES, "valid", "saturated")]
     for group, variable in needed:
@@ -42,7 +42,7 @@ def _missing(result: xr.DataTree, name: str) -> str:
 
 @once
 def curves(fit: FitView, name: str) -> list[xr.Dataset]:
-    """One recorded variable and its prediction by view, for each material and wavelength."""
+    """Return a recorded variable and its prediction by view, for each material and wavelength."""
     result = fit.result
     if name not in variables(fit):
         lacks = f", for it has no {_missing(result, name)}" if name in QUANTITIES else ""
@@ -79,20 +79,20 @@ def curves(fit: FitView, name: str) -> list[xr.Dataset]:
 
 
 def minus_center(curve: xr.Dataset) -> xr.Dataset:
-    """Readings and predictions as distances from the fitted curve."""
+    """Return readings and predictions minus the fitted curve."""
     return curve.assign(
         {name: curve[name] - curve["center"] for name in ("observed", "levels", "center")}
     )
 
 
 def _at(curve: xr.Dataset, views: np.ndarray) -> xr.Dataset:
-    """Some of the views, sorted by zenith."""
+    """Select views, and sort them by zenith."""
     chosen = curve.isel(view=np.flatnonzero(views & np.isfinite(curve["zenith"].to_numpy())))
     return chosen.isel(view=np.argsort(chosen["zenith"].to_numpy(), kind="stable"))
 
 
 def _is_smooth(curve: xr.Dataset) -> bool:
-    """True where neighbors in zenith belong to one curve: one light, or the light follows."""
+    """Return whether neighbors in zenith form one curve: the light is fixed or follows."""
     zenith, light = curve["zenith"].to_numpy(), curve["light_zenith"].to_numpy()
     if zenith.size < 3:
         return False
@@ -101,7 +101,7 @@ def _is_smooth(curve: xr.Dataset) -> bool:
 
 @style.styled
 def plot_readings(result: xr.DataTree | FitView, name: str) -> Figure:
-    """One recorded variable against view zenith, with posterior median and predictive bands.
+    """Plot a variable against view zenith, with posterior median and predictive bands.
 
     With 2 to 4 azimuths between view and light: a row for every material and wavelength (at most
     6), a column for every azimuth. Otherwise one panel for every material and wavelength.
@@ -126,7 +126,7 @@ def plot_readings(result: xr.DataTree | FitView, name: str) -> Figure:
 
 @style.styled
 def readings_at_a_glance(fit: FitView) -> Figure:
-    """The first variable of the first material and color, on the mirror side: one small panel."""
+    """Plot the first variable of the first material and color in a small panel."""
     name = variables(fit)[0]
     curve = curves(fit, name)[0]
     azimuths = _azimuths([curve])
@@ -147,7 +147,7 @@ def readings_at_a_glance(fit: FitView) -> Figure:
 
 @style.styled
 def plot_residuals(result: xr.DataTree | FitView, name: str) -> Figure:
-    """The same after subtracting the fitted curve: where the model misses, and by how much.
+    """Plot readings minus the fitted curve against view zenith, with predictive bands.
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
@@ -199,7 +199,7 @@ type Panels = list[tuple[Axes, xr.Dataset]]
 def _panels_by_azimuth(
     shown: list[xr.Dataset], azimuths: list[float], label: str
 ) -> tuple[Figure, Panels]:
-    """A row for each curve, a column for each azimuth."""
+    """Draw a row for each curve, and a column for each azimuth."""
     figure = style.NotebookFigure(figsize=(8.2, 1.75 * len(shown) + 0.9), layout="constrained")
     axes = figure.subplots(len(shown), len(azimuths), sharex=True, sharey=True, squeeze=False)
     panels: Panels = []
@@ -214,7 +214,7 @@ def _panels_by_azimuth(
 
 
 def _panels_by_curve(shown: list[xr.Dataset], label: str) -> tuple[Figure, Panels]:
-    """One panel for each curve, whatever its azimuths."""
+    """Draw one panel for each curve, with all its azimuths."""
     columns = {1: 1, 2: 2, 4: 2}.get(len(shown), COLUMNS)
     rows = -(-len(shown) // columns)
     size = (8.2, 2.1 * rows + 0.9) if columns > 1 else (6.6, 3.9)
@@ -234,7 +234,7 @@ def _panels_by_curve(shown: list[xr.Dataset], label: str) -> tuple[Figure, Panel
 
 
 def _azimuths(found: list[xr.Dataset], most: int = 4) -> list[float]:
-    """The distinct azimuths between view and light, to the degree; none if there are many."""
+    """Return distinct azimuths between view and light, to the degree; none if too many."""
     azimuths = np.concatenate([curve["azimuth"] for curve in found])
     distinct = sorted(set(np.round(azimuths[np.isfinite(azimuths)])), reverse=True)
     return [float(each) for each in distinct] if len(distinct) <= most else []
@@ -295,7 +295,7 @@ FINE = 61
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Spectrum:
-    """One parameter of one member: quantiles `at` the measured wavelengths, or between them."""
+    """A parameter of one member, with quantiles `at` measured or intermediate wavelengths."""
 
     title: str
     label: str
@@ -306,13 +306,13 @@ class Spectrum:
 
     @property
     def is_band(self) -> bool:
-        """Whether it is known between the measured wavelengths."""
+        """True if the parameter is known between the measured wavelengths."""
         return self.at is not self.measured
 
 
 @once
 def spectra(fit: FitView) -> dict[str, list[Spectrum]]:
-    """Each parameter of a fit over wavelength, of at most 12 members."""
+    """Return each parameter of a fit over wavelength, for at most 12 members."""
     names = {scalar.name for scalar in fit.scalars}
     found: dict[str, dict[str, list[Scalar]]] = {}
     for scalar in fit.scalars:
@@ -338,7 +338,7 @@ def spectra(fit: FitView) -> dict[str, list[Spectrum]]:
 
 
 def _can_be_drawn(members: Mapping[str, Sequence[Scalar]]) -> bool:
-    """Whether there are two wavelengths, and all draws are finite."""
+    """Return whether there are two wavelengths, and all draws are finite."""
     return all(
         len({scalar.labels["wavelength"] for scalar in own}) > 1
         and all(bool(np.isfinite(scalar.draws).all()) for scalar in own)
@@ -347,7 +347,7 @@ def _can_be_drawn(members: Mapping[str, Sequence[Scalar]]) -> bool:
 
 
 def _bands(fit: FitView, between: np.ndarray) -> dict[str, dict[int, np.ndarray]]:
-    """Quantiles between the measured wavelengths, by parameter and number of the member."""
+    """Return quantiles between measured wavelengths, by parameter and number of the member."""
     result, posterior = fit.result, fit.posterior
     step = max(1, posterior.sizes["chain"] * posterior.sizes["draw"] // 1000)
     chosen = {"draw": slice(None, None, step)}
@@ -397,7 +397,7 @@ def _spectrum(
 
 @style.styled
 def plot_spectrum(result: xr.DataTree | FitView, name: str) -> Figure:
-    """One parameter over wavelength: median, 50% and 95%, a panel for each member.
+    """Plot a parameter over wavelength: median, 50% and 95%, one panel per member.
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.

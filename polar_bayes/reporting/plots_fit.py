@@ -1,4 +1,4 @@
-"""Figures of a fit: its parameters, its checks, and the members of its populations."""
+"""Figures of a fit: parameters, checks, and members of populations."""
 
 import itertools
 
@@ -38,7 +38,7 @@ from polar_bayes.reporting.style import (
 
 @once
 def drawable(fit: FitView, *, material: bool = False) -> list[Scalar]:
-    """The parameters that figures show: single numbers that are finite and move."""
+    """Return the parameters that figures show: finite scalars that are not constant."""
     found = [
         scalar
         for scalar in fit.scalars
@@ -51,14 +51,14 @@ def drawable(fit: FitView, *, material: bool = False) -> list[Scalar]:
 
 
 def _first_material_first(scalar: Scalar) -> tuple[bool, list[int]]:
-    """Figures have room for a few: all parameters of one material, then those of the next."""
+    """Sort parameters by material, since figures show only the first few."""
     places = [at for dim, at in scalar.index.items() if dim != "wavelength"]
     return not scalar.is_material, places
 
 
 @style.styled
 def plot_pairs(result: xr.DataTree | FitView) -> Figure:
-    """Joint draws of the material parameters (the first material, at most 8), and correlations.
+    """Plot joint draws and correlations of up to 8 parameters of the first material.
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
@@ -121,7 +121,7 @@ def plot_pairs(result: xr.DataTree | FitView) -> Figure:
 
 @style.styled
 def plot_ranks(result: xr.DataTree | FitView) -> Figure:
-    """How each chain's draws rank among all draws: flat and overlapping lines are good.
+    """Plot ranks of each chain's draws among all draws: flat, overlapping lines are good.
 
     Args:
         result: A tree with at least two chains.
@@ -160,7 +160,7 @@ def plot_ranks(result: xr.DataTree | FitView) -> Figure:
 
 @style.styled
 def plot_prior_posterior(result: xr.DataTree | FitView) -> Figure:
-    """Prior against posterior: what the data added.
+    """Plot prior against posterior: the information in the data.
 
     Args:
         result: A tree with draws of the prior.
@@ -213,7 +213,7 @@ def plot_prior_posterior(result: xr.DataTree | FitView) -> Figure:
 
 @style.styled
 def plot_pit(result: xr.DataTree | FitView) -> Figure:
-    """PIT and leave-one-out PIT of every variable: distance from the uniform distribution.
+    """Plot PIT and leave-one-out PIT of every variable minus the uniform distribution.
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
@@ -258,7 +258,7 @@ def _scaled_histogram(
     share: float,
     label: str,
 ) -> None:
-    """A histogram over its own range, scaled to height 1."""
+    """Return a histogram over its own range, scaled to height 1."""
     inside = values[(values >= limits[0]) & (values <= limits[1])]
     bins = 16 if inside.size < 1000 else 30
     largest = np.abs(inside).max(initial=0.0)
@@ -306,7 +306,7 @@ MAX_MEMBERS = 60
 
 @style.styled
 def plot_shrinkage(result: xr.DataTree | FitView, label: str) -> Figure:
-    """Every member of one population: alone (hollow), pooled (filled), and the population.
+    """Plot members of a population alone (hollow) and pooled (filled), and the population.
 
     Args:
         result: A tree that `polar_bayes.fit` returned, or one read back from a file.
@@ -363,7 +363,7 @@ def plot_shrinkage(result: xr.DataTree | FitView, label: str) -> Figure:
 
 
 def _member_name(scalar: Scalar, population: Population) -> str:
-    """What distinguishes a member: `patch 3`, but the name alone where a material has one."""
+    """Return what identifies a member, such as `patch 3`; a unique material's name alone."""
     names = [
         style.coordinate_label(dim, label) if label.isdigit() else label
         for dim, label in scalar.labels.items()
@@ -375,7 +375,7 @@ def _member_name(scalar: Scalar, population: Population) -> str:
 def _shrinkage_limits(
     axes: Axes, population: Population, whole: pd.Series, rows: pd.DataFrame
 ) -> tuple[float, float]:
-    """All pooled values, the truth, and estimates alone that are not too far away."""
+    """Return limits around pooled values, the truth, and unpooled values not too far off."""
     pooled = np.concatenate(
         [rows[["q2.5", "q97.5"]].to_numpy().ravel(), whole[["new_q2.5", "new_q97.5"]]]
     ).astype(float)

@@ -1,4 +1,4 @@
-"""The standard report of every kind of result, and its summary for a notebook or a terminal."""
+"""Standard reports of every kind of result, and summaries for notebooks and terminals."""
 
 import dataclasses
 import functools
@@ -28,7 +28,7 @@ from polar_bayes.repr_html import DisplaySummary, HTMLRepr, Row, Table
 from polar_bayes.results import kind_of, save, summary, verdict
 
 MAX_ROWS = 40
-"""Rows of a table in a notebook or a terminal."""
+"""Largest number of rows of a table in a notebook or terminal."""
 
 HINTS = {
     "truth": "leave it out: a fit carries the truth of its capture",
@@ -48,7 +48,7 @@ def report(
     comparisons: Mapping[str, xr.DataTree] | None = None,
     capture: xr.Dataset | None = None,
 ) -> Path:
-    """Write the standard report of any result, or of several fits side by side: one `index.html`.
+    """Write the standard report of a result, or of several fits side by side: `index.html`.
 
     The page needs no network, no script and no other file. Everything on it is computed from the
     result, so a report of a file read back is the same report. The folder of a fit also holds
@@ -97,7 +97,7 @@ def report(
 
 
 def render(result: Any, **options: Any) -> str:
-    """The report as HTML; options that are None are left out."""
+    """Return the report as HTML; options that are None are omitted."""
     own = report_of(result)
     given = {name: value for name, value in options.items() if value is not None}
     for name in given:
@@ -108,7 +108,7 @@ def render(result: Any, **options: Any) -> str:
 
 
 def show(result: Any) -> DisplaySummary:
-    """What a result, a capture, a scene or a table of priors says, for the last line of a cell.
+    """Return a summary of a result, capture, scene or table of priors, for notebooks.
 
     Args:
         result: A result of any kind, or one read back from a file; a capture; a scene, a set-up, or
@@ -129,7 +129,7 @@ def show(result: Any) -> DisplaySummary:
 
 
 def _result_card(result: Any) -> DisplaySummary:
-    """The card of a result."""
+    """Return the card of a result."""
     kind = kind_of(result)
     if not kind.reports:
         return _described_card(result)
@@ -150,7 +150,7 @@ def _is_capture(value: Any) -> bool:
 
 
 def _capture_card(given: xr.Dataset) -> DisplaySummary:
-    """Variables with their range, what they say at first sight, and what is unlikely."""
+    """Return variables with ranges, first conclusions from readings, and cautions."""
     capture = validate(given)
     columns = ("variable", "dims", "unit", "least", "largest", "meaning")
     rows = []
@@ -168,7 +168,7 @@ def _capture_card(given: xr.Dataset) -> DisplaySummary:
 
 
 def _value_card(value: HTMLRepr) -> DisplaySummary:
-    """The fields of a scene, set-up, part, link or method, and the parameters of a scene."""
+    """Return fields of a scene, set-up, part, link or method, and parameters of a scene."""
     fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}  # type: ignore[arg-type]
     about = (inspect.getdoc(type(value)) or "").partition("\n")[0]
     sentences = [about, *(f"{name}: {_field_text(each)}" for name, each in fields.items())]
@@ -189,7 +189,7 @@ def _are_priors(value: Any) -> bool:
 
 
 def _described_card(result: xr.Dataset) -> DisplaySummary:
-    """A result that describes and cannot fail: its table and its sentences."""
+    """Return table and sentences of a descriptive result, which has no verdict."""
     found = summary(result)
     rows = tuple(
         Row(str(label), tuple(f"{x:.4g}" if isinstance(x, float) else str(x) for x in cells))

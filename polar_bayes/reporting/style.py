@@ -1,4 +1,4 @@
-"""Style of figures: colors that everybody can tell apart, labels with units, shared helpers.
+"""Style of figures: a color-blind safe palette, labels with units, and helpers.
 
 A matplotlib style that the user has chosen is respected: the settings here fill in what it leaves
 at its default. The colors of text and background follow that style; colors with a meaning stay.
@@ -35,7 +35,7 @@ VERMILLION, PURPLE = "#d55e00", "#cc79a7"
 CHAIN_COLORS = (BLUE, ORANGE, GREEN, PURPLE, VERMILLION, SKY)
 
 MAX_PANELS = 12
-"""Parameters of one figure: more would be too small to read."""
+"""Largest number of parameters in one figure."""
 
 STYLE: Any = {
     "font.size": 9.0,
@@ -53,7 +53,7 @@ STYLE: Any = {
     "ytick.major.size": 3.0,
     "figure.labelsize": 9.0,
 }
-"""Defaults of this package, each replaced by a setting of the user."""
+"""Default style; settings of the user replace these."""
 
 FIXED_STYLE: Any = {
     # Names of captures and materials are text, whatever dollar signs they contain.
@@ -64,7 +64,7 @@ FIXED_STYLE: Any = {
     "svg.hashsalt": "polar_bayes",
     "path.simplify": True,
 }
-"""Settings that hold in every style."""
+"""Settings that apply to every style."""
 
 QUANTITIES = {
     "dop": "degree of polarization",
@@ -80,7 +80,7 @@ type Look = dict[str, Any]
 
 
 def styled[**P, R](draw: Callable[P, R]) -> Callable[P, R]:
-    """Run a drawing function in the user's style, with the defaults here where it has none."""
+    """Decorate a drawing function to use the user's style, and these defaults elsewhere."""
 
     @functools.wraps(draw)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -102,17 +102,17 @@ def _settings() -> Any:
 
 
 def text_color() -> str:
-    """The color of text and readings in the current style."""
+    """Return the color of text and readings in the current style."""
     return str(matplotlib.colors.to_hex(matplotlib.rcParams["text.color"]))
 
 
 def background() -> str:
-    """The background color of the current style."""
+    """Return the background color of the current style."""
     return str(matplotlib.colors.to_hex(matplotlib.rcParams["axes.facecolor"]))
 
 
 def lighten(color: str, share: float) -> tuple[float, float, float]:
-    """A color mixed with the background's: areas need no transparency (print, old readers)."""
+    """Mix a color with the background's, instead of transparency."""
     rgb, white = (np.array(matplotlib.colors.to_rgb(each)) for each in (color, background()))
     red, green, blue = rgb + (white - rgb) * share
     return float(red), float(green), float(blue)
@@ -122,7 +122,7 @@ def lighten(color: str, share: float) -> tuple[float, float, float]:
 
 
 class NotebookFigure(Figure):
-    """A figure that a notebook shows without pyplot, drawn in the style that it was made in."""
+    """A figure that notebooks show without pyplot, drawn in the style of its creation."""
 
     def __init__(self, *args: Any, **settings: Any) -> None:
         super().__init__(*args, **settings)
@@ -143,7 +143,7 @@ class NotebookFigure(Figure):
 def grid(
     count: int, *, columns: int = 3, width: float = 8.2, panel_height: float, header: float = 0.0
 ) -> tuple[Figure, list[Axes]]:
-    """A figure of equal panels in rows, unit inch."""
+    """Return a figure of equal panels in rows, unit inch."""
     columns = max(1, min(columns, count))
     rows = max(1, math.ceil(count / columns))
     figure = NotebookFigure(figsize=(width, rows * panel_height + header), layout="constrained")
@@ -167,26 +167,26 @@ def add_legend(figure: Figure, columns: int, colors: Mapping[str, str] = {}) -> 
 
 
 def set_panel_title(axes: Axes, title: str) -> None:
-    """A title of at most two lines, as wide as one of three panels."""
+    """Set a title of at most two lines, as wide as one of three panels."""
     axes.set_title(wrap(title, 42), loc="left")
 
 
 def plain_numbers(*axes: Axis) -> None:
-    """Tick labels of logarithmic axes without math text, which the style does not parse."""
+    """Set tick labels of logarithmic axes without math text, which the style does not parse."""
     for axis in axes:
         axis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axis.set_minor_formatter(NullFormatter())
 
 
 def padded_range(values: np.ndarray, margin: float) -> tuple[float, float]:
-    """Limits of an axis around values, `margin` a share of their range."""
+    """Return limits of an axis around values; `margin` is a share of their range."""
     low, high = float(np.min(values)), float(np.max(values))
     pad = margin * (high - low) or 1.0
     return low - pad, high + pad
 
 
 def write_in_panel(axes: Axes, text: str) -> None:
-    """A text in place of a figure that cannot be drawn."""
+    """Write a text in place of a figure that cannot be drawn."""
     axes.text(0.5, 0.5, text, ha="center", transform=axes.transAxes, color=GRAY)
 
 
@@ -200,7 +200,7 @@ def true_value_style() -> Look:
 
 
 def parameter_title(scalar: Scalar, posterior: xr.Dataset) -> str:
-    """A parameter's name, symbol, unit and coordinates: `refractive index n, 450 nm`."""
+    """Return name, symbol, unit and coordinates: `refractive index n, 450 nm`."""
     attributes = posterior[scalar.name].attrs
     name = str(attributes.get("long_name", scalar.name.replace("_", " ")))
     name = {"absorption relative to scattering": "absorption"}.get(name, name)
@@ -209,37 +209,37 @@ def parameter_title(scalar: Scalar, posterior: xr.Dataset) -> str:
 
 
 def short_title(scalar: Scalar, posterior: xr.Dataset) -> str:
-    """The same without coordinates."""
+    """Return name, symbol and unit of a parameter, without coordinates."""
     return parameter_title(scalar, posterior).partition(", ")[0]
 
 
 def quantity_label(name: str, symbol: str, unit: object) -> str:
-    """`refractive index n`, `exposure [s]`."""
+    """Return a label such as `refractive index n` or `exposure [s]`."""
     label = f"{name} {'β' if symbol == 'beta' else symbol}".strip()
     return label if str(unit) == "1" else f"{label} [{unit}]"
 
 
 def coordinate_labels(scalar: Scalar) -> list[str]:
-    """Every coordinate of a parameter with its unit or dimension."""
+    """Return every coordinate of a parameter with its unit or dimension."""
     return [coordinate_label(dim, label) for dim, label in scalar.labels.items()]
 
 
 def coordinate_label(dim: str, label: str) -> str:
-    """`450 nm`, `material leaf`."""
+    """Return a label such as `450 nm` or `material leaf`."""
     if dim == "wavelength":
         return f"{label} nm"
     return label if dim.endswith(tuple("0123456789")) else f"{dim} {label}"
 
 
 def label_text(text: str, longest: int = 60) -> str:
-    """Text on one line in letters of the font, cut where it is too long."""
+    """Return text on one line in letters of the font, truncated where it is too long."""
     known = _characters()
     drawn = "".join(c if ord(c) in known else "□" for c in one_line(text))
     return drawn if len(drawn) <= longest else f"{drawn[: longest - 1]}…"
 
 
 def wrap(text: str, width: int, lines: int = 2) -> str:
-    """Text broken into short lines, cut where there are too many."""
+    """Break text into short lines, truncated after a number of them."""
     return "\n".join(textwrap.wrap(text, width, max_lines=lines, placeholder="…"))
 
 

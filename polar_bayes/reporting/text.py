@@ -38,11 +38,11 @@ from polar_bayes.results import MIN_GOOD_SHARE, verdict
 
 DASH = "\N{EN DASH}"
 MAX_NAMED = 6
-"""Longer lists of names end with `and 3 more`."""
+"""Number of names after which lists end with `and 3 more`."""
 
 
 def number(value: float, scale: float) -> str:
-    """As many decimals as show two digits of the scale (three if it begins with 1)."""
+    """Format a number with two digits of the scale (three if it begins with 1)."""
     decimals = 3
     if math.isfinite(scale) and scale > 0.0:
         decimals = min(max(1 - math.floor(math.log10(scale / 2.0)), 0), 8)
@@ -51,26 +51,26 @@ def number(value: float, scale: float) -> str:
 
 
 def numbers(values: Iterable[float], scale: float) -> list[str]:
-    """Several numbers with the digits of one scale."""
+    """Format several numbers with the digits of one scale."""
     return [number(value, scale) for value in values]
 
 
 def interval(low: float, high: float, scale: float | None = None) -> str:
-    """`[1.44, 1.52]`, with the digits of the scale (by default a quarter of its width)."""
+    """Format `[1.44, 1.52]` with the digits of a scale, by default a quarter of its width."""
     if not math.isfinite(high - low):
         return DASH
     return f"[{', '.join(numbers([low, high], (high - low) / 4.0 if scale is None else scale))}]"
 
 
 def percent(share: float) -> str:
-    """`12%`; one digit more below 10%."""
+    """Format a share as `12%`, with one more digit below 10%."""
     if not math.isfinite(share):
         return DASH
     return f"{share:.1%}" if share < 0.0995 else f"{share:.0%}"
 
 
 def count_percent(count: int, total: int) -> str:
-    """A share in percent that is never rounded to 0 or 100%."""
+    """Format a share in percent; it is never rounded to 0 or 100%."""
     if total == 0:
         return DASH
     text = percent(count / total)
@@ -80,17 +80,17 @@ def count_percent(count: int, total: int) -> str:
 
 
 def or_dash(value: float, form: str) -> str:
-    """A number in the given format, or a dash where it is not finite."""
+    """Format a number, or return a dash if it is not finite."""
     return format(value, form) if math.isfinite(value) else DASH
 
 
 def column(name: str, form: str) -> Callable[[pd.Series], str]:
-    """Cells of a table: one column of its row in the given format, or a dash."""
+    """Return a function that formats one column of a row, or a dash."""
     return lambda row: or_dash(row[name], form)
 
 
 def elpd_difference(row: pd.Series) -> str:
-    """Cell: the difference in expected log density to the best, with its standard error."""
+    """Format the difference in expected log density to the best, with standard error."""
     if row["dse"] == 0.0:
         return DASH
     return " ± ".join(numbers([row["elpd_diff"], row["dse"]], max(row["dse"], 0.2)))
@@ -104,7 +104,7 @@ SENSITIVITY_CELLS: Mapping[str, Callable[[pd.Series], str]] = {
 
 
 def p_value(level: float) -> Callable[[pd.Series], str]:
-    """Cells of a table: p-values, marked where the test fails at that level."""
+    """Return a function that formats p-values, marked where the test fails at a level."""
 
     def cell(row: pd.Series) -> str:
         return or_dash(row["p_value"], ".2g") + (" (fails)" if row["p_value"] < level else "")
@@ -113,13 +113,13 @@ def p_value(level: float) -> Callable[[pd.Series], str]:
 
 
 def join_first(names: Sequence[str]) -> str:
-    """The first names of many: `a, b and 3 more`."""
+    """Join the first of many names: `a, b and 3 more`."""
     more = len(names) - MAX_NAMED
     return join([*names[:MAX_NAMED], *([f"{more} more"] if more > 0 else [])])
 
 
 def capture_name(provenance: Provenance, default: str = "capture") -> str:
-    """The name of the capture that a result is of."""
+    """Return the name of the capture of a result."""
     capture = provenance.get("capture")
     name = capture.get("name") if isinstance(capture, Mapping) else capture
     return one_line(str(name or default))
@@ -133,7 +133,7 @@ HELD, PRIOR = " held fixed", "prior of "
 
 
 def fit_headline(fit: FitView) -> str:
-    """The verdict in one sentence."""
+    """Return the verdict in one sentence."""
     method, verdict = fit.method, convergence.verdict(fit)
     name = METHODS[method].subject if method in METHODS else "The method"
     if not verdict.converged:
@@ -147,7 +147,7 @@ def fit_headline(fit: FitView) -> str:
 
 
 def made_by(provenance: Provenance, method: str) -> str:
-    """Scene, model, method and seed in one line."""
+    """Return scene, model, method and seed in one line."""
     parts = {
         key: f"{key} {one_line(str(provenance[key]))}"
         for key in ("scene", "model", "seed")
@@ -159,7 +159,7 @@ def made_by(provenance: Provenance, method: str) -> str:
 
 
 def swapped_sentence(provenance: Provenance) -> str:
-    """What the user replaced, in one sentence."""
+    """State what the user replaced."""
     if "swapped" not in provenance:
         return ""
     swapped = [str(name) for name in provenance["swapped"]]
@@ -174,7 +174,7 @@ def swapped_sentence(provenance: Provenance) -> str:
 
 
 def determined(fit: FitView) -> list[str]:
-    """Which material parameters the data determine; nothing of a fit that failed."""
+    """State which material parameters the data determine; empty for a failed fit."""
     if not convergence.verdict(fit).passed:
         return []
     judgement = sensitivity(fit)["verdict"]
@@ -194,7 +194,7 @@ def determined(fit: FitView) -> list[str]:
 
 
 def between_members(fit: FitView) -> list[str]:
-    """How much the members of each population differ, and where a new one would lie."""
+    """State how much members of each population differ, and the range of a new one."""
     summary = population_summary(fit)
     groups: dict[str, list[Population]] = {}
     for each in populations(fit):
@@ -227,7 +227,7 @@ def _between(summary: pd.DataFrame, group: Sequence[Population], posterior: xr.D
 
 
 def pooling(fit: FitView) -> list[str]:
-    """Whether the readings of a member or its population decide, population by population."""
+    """State, by population, whether readings or the population determine its members."""
     summary = population_summary(fit)
     groups: dict[bool, list[str]] = {}
     for each in populations(fit):
@@ -237,16 +237,16 @@ def pooling(fit: FitView) -> list[str]:
             name = f"{', '.join(names)} ({factor:.2f})"
             groups.setdefault(bool(factor > 0.5), []).append(name)
     phrases = {
-        True: "For {} the population says more than the readings of a single member (pooling "
+        True: "The population determines {} more than the readings of a single member (pooling "
         "factor in brackets): quote such estimates as those of a member of this population.",
-        False: "For {} the readings of a single member say more than the population (pooling "
+        False: "The readings of a single member determine {} more than the population (pooling "
         "factor in brackets).",
     }
     return [phrases[is_pooled].format(join(names)) for is_pooled, names in groups.items()]
 
 
 def parameter_names(scalars: Sequence[Scalar], posterior: xr.Dataset) -> str:
-    """`roughness r and refractive index n at 450, 550 and 650 nm`."""
+    """Format `roughness r and refractive index n at 450, 550 and 650 nm`."""
     groups: dict[str, list[Scalar]] = {}
     for scalar in scalars:
         groups.setdefault(short_title(scalar, posterior), []).append(scalar)
@@ -254,7 +254,7 @@ def parameter_names(scalars: Sequence[Scalar], posterior: xr.Dataset) -> str:
 
 
 def _coordinates(group: Sequence[Scalar], posterior: xr.Dataset) -> str:
-    """` at 450 and 550 nm`, ` (material leaf, 450 nm; material fruit, 450 nm)` or nothing."""
+    """Format ` at 450 and 550 nm`, ` (material leaf, 450 nm)`, or an empty text."""
     if not group[0].labels:
         return ""
     if list(group[0].labels) == ["wavelength"]:
@@ -267,7 +267,7 @@ def _coordinates(group: Sequence[Scalar], posterior: xr.Dataset) -> str:
 
 
 def predictive_sentences(fit: FitView) -> list[str]:
-    """Whether readings scatter about their predictions as the model says, by its one check."""
+    """State whether the scatter of readings around predictions agrees with the model."""
     check = criticize(fit).loc["leave-one-out"]
     sentences = [str(check["sentence"])] if check["sentence"] else []
     if check["level"] == "passed" and math.isfinite(check["p_value"]):
@@ -279,7 +279,7 @@ def predictive_sentences(fit: FitView) -> list[str]:
         if each.loo and each.loo.unreliable:
             effect = (
                 "leave-one-out cannot be approximated with these draws, so its results on this "
-                "page mean little."
+                "page are unreliable."
                 if 2 * each.loo.unreliable > each.count
                 else "they are so influential that leave-one-out cannot be approximated for them. "
                 "Inspect them first."
@@ -292,7 +292,7 @@ def predictive_sentences(fit: FitView) -> list[str]:
 
 
 def index_sentences(fit: FitView) -> list[str]:
-    """What is the refractive index, in a sentence; of many, the range of them."""
+    """State the refractive index, or the range of several."""
     found = [scalar for scalar in fit.scalars if scalar.name == "refractive_index"]
     if not found or fit.method == "point":
         return []
@@ -312,7 +312,7 @@ def index_sentences(fit: FitView) -> list[str]:
 
 
 def next_sentence(result: xr.DataTree) -> str:
-    """What to measure next, where the result has the answer of `polar_bayes.next_views`."""
+    """State what to measure next, if the result holds `polar_bayes.next_views`."""
     if "next_views" not in result.children:
         return (
             "What to measure next is not worked out here: polar-bayes report does it, or "
@@ -335,7 +335,7 @@ def next_sentence(result: xr.DataTree) -> str:
 
 
 def setup_beside_views(fit: FitView) -> list[str]:
-    """What knowing the set-up better does for n, beside further views, where it matters."""
+    """State what better knowledge of the set-up does for n, if it matters."""
     wider = wider_by_setup(fit).filter(like="refractive_index")
     if "next_views" not in fit.result.children or wider.empty:
         return []
@@ -346,7 +346,7 @@ def setup_beside_views(fit: FitView) -> list[str]:
 
 
 def trust(fit: FitView) -> str:
-    """Whether the intervals can be trusted, as far as one fit can tell."""
+    """State whether the intervals can be trusted, as far as one fit can tell."""
     verdict = convergence.verdict(fit)
     if fit.method == "point":
         return (
@@ -354,7 +354,7 @@ def trust(fit: FitView) -> str:
             "so do not read them as intervals."
         )
     if verdict.cautions:
-        return "Trust the intervals with care: the cautions say what speaks against them."
+        return "Use the intervals with care: see the cautions."
     return (
         f"{verdict.nothing_against} A calibration of this layout shows how "
         "often such intervals contain the truth, if the scene is the right one."
@@ -362,12 +362,12 @@ def trust(fit: FitView) -> str:
 
 
 def notes(verdict: Verdict) -> list[str]:
-    """What a reader may want to know of a fit, which changes nothing about its verdict."""
+    """List remarks on a fit that do not affect its verdict."""
     return [f"Note: {finding}" for finding in verdict.findings]
 
 
 def overconfidence(fit: FitView, compared: pd.DataFrame, part: str) -> list[str]:
-    """What to make of a fit that leaves out a part of the instrument."""
+    """State how to interpret a fit that leaves out a part of the instrument."""
     posterior = fit.posterior
     shared = [scalar for scalar in fit.scalars if scalar.label in compared.index]
     gain = {scalar: 1.0 - compared.loc[scalar.label, "width_ratio"] for scalar in shared}
@@ -410,28 +410,29 @@ def _intervals_are(scalars: Sequence[Scalar], posterior: xr.Dataset) -> str:
 # --- Comparisons of fits --------------------------------------------------------------------------
 
 CLEAR = 4.0
-"""Differences of the expected log density below it say little (Sivula et al. 2020), unit nat."""
+"""Difference of expected log densities, in nats, below which it says little (Sivula et al.
+2020)."""
 
 
 def comparison_headline(comparison: FitComparison) -> str:
-    """Which fit predicts best, or that this cannot be told."""
+    """State which fit predicts best, or that the readings do not decide."""
     failed = [name for name, verdict in comparison.verdicts.items() if not verdict.passed]
     if failed:
         return f"Do not use the numbers of {join(failed)}: read why first."
     if len(comparison.loo) < 2:
         return "Predictions are not compared; parameters are."
     if not _is_clearly_worse(comparison.loo.iloc[1]):
-        return "The readings do not tell which of these fits predicts best."
+        return "The readings do not decide which of these fits predicts best."
     return f"{comparison.loo.index[0]} predicts the readings best."
 
 
 def _is_clearly_worse(row: pd.Series) -> bool:
-    """Whether a fit predicts worse than the best beyond doubt."""
+    """Return whether a fit predicts significantly worse than the best."""
     return bool(-row["elpd_diff"] >= max(CLEAR, 2.0 * row["dse"]))
 
 
 def comparison_of_fits_sentences(comparison: FitComparison) -> list[str]:
-    """What the fits say about the readings, and on which parameters they disagree.
+    """State the evidence of readings, and on which parameters fits disagree.
 
     Args:
         comparison: Of `polar_bayes.diagnostics.compare_fits`.
@@ -462,7 +463,7 @@ def comparison_of_fits_sentences(comparison: FitComparison) -> list[str]:
 
 
 def _disagreements(table: pd.DataFrame) -> list[str]:
-    """Pairs of intervals that do not overlap."""
+    """List pairs of intervals that do not overlap."""
     apart, shared = [], 0
     for label, own in table.groupby(level="parameter", sort=False):
         known = own.droplevel("parameter").dropna(subset=["q2.5", "q97.5"])
@@ -483,7 +484,7 @@ def _disagreements(table: pd.DataFrame) -> list[str]:
 # --- Maps -----------------------------------------------------------------------------------------
 
 SLIGHT = 0.01
-"""A smaller error of the coverage gives no warning, however many pixels show it."""
+"""Error of the coverage below which there is no warning, however many pixels show it."""
 
 METHODS_USED = {
     "none": "no numbers",
@@ -496,14 +497,14 @@ METHODS_USED = {
 
 
 def map_headline(counts: pd.DataFrame) -> tuple[str, bool]:
-    """How many pixels have an answer, and whether that is enough."""
+    """State how many pixels have an answer, and whether they are enough."""
     by_status = counts.sum(axis=1)
     total, good = int(by_status.sum()), int(by_status.get("good", 0))
     read = total - int(by_status.get("masked", 0))
     if read == 0:
         return "No pixel was read: these maps are empty.", False
     if good == 0 and by_status.get("contradicted", 0):
-        return "No pixel has an answer that its readings bear out: do not use these maps.", False
+        return "Readings contradict every pixel that has an answer: do not use these maps.", False
     if good == 0:
         return "No pixel has an answer: do not use these maps.", False
     if good == read:
@@ -521,7 +522,7 @@ def no_explorer() -> str:
 
 
 def pixel_sentences(counts: pd.DataFrame) -> list[str]:
-    """How many pixels have each status; `maps.criticism_sentences` tells the contradicted ones."""
+    """State how many pixels have each status."""
     by_status = {str(status): int(number) for status, number in counts.sum(axis=1).items()}
     total, good = sum(by_status.values()), by_status.get("good", 0)
     sentences = []
@@ -551,7 +552,7 @@ def pixel_sentences(counts: pd.DataFrame) -> list[str]:
 
 
 def coverage_error(row: pd.Series, claimed: int) -> int:
-    """-1 where intervals contain the truth too seldom, 1 where too often, 0 otherwise."""
+    """Return -1 if intervals contain the truth too rarely, 1 if too often, 0 otherwise."""
     error = row[f"held_{claimed}"] - claimed / 100
     if error < -SLIGHT and row[f"held_{claimed}_high"] < claimed / 100:
         return -1
@@ -559,7 +560,7 @@ def coverage_error(row: pd.Series, claimed: int) -> int:
 
 
 def coverage_sentences(titles: Mapping[str, str], coverage: pd.DataFrame) -> list[str]:
-    """Whether the 95% intervals contain the truth as often as they should."""
+    """State whether 95% intervals contain the truth as often as they should."""
     groups: dict[int, list[str]] = {}
     for label, title in titles.items():
         if label in coverage.index and coverage.loc[label, "answered"]:
@@ -577,7 +578,7 @@ def coverage_sentences(titles: Mapping[str, str], coverage: pd.DataFrame) -> lis
 
 
 def counted_pixels(coverage: pd.DataFrame) -> list[str]:
-    """Which pixels the coverage counts, and which it leaves out."""
+    """State which pixels the coverage counts, and which it leaves out."""
     sentences = []
     for counts, rows in coverage.groupby(["unknown", "masked", "unanswered", "answered"]):
         *others, answered = (int(count) for count in counts)
@@ -593,7 +594,7 @@ def counted_pixels(coverage: pd.DataFrame) -> list[str]:
 
 
 def calibration_headline(table: pd.DataFrame, readings: pd.DataFrame | None) -> tuple[str, bool]:
-    """The verdict in a few words, and whether all is well."""
+    """Return the verdict in a few words, and whether all tests pass."""
     passed = is_calibrated(table)
     answered = float((table["answered"] / (table["answered"] + table["failed"])).min())
     headline = "Calibrated" if passed else "Not calibrated"
@@ -606,25 +607,25 @@ def calibration_headline(table: pd.DataFrame, readings: pd.DataFrame | None) -> 
 
 
 def verdict_after_headline(calibration: CalibrationView) -> list[str]:
-    """Sentences of `calibration_verdict` without the first words, which the headline says."""
+    """Return `calibration_verdict` without the words that the headline repeats."""
     first, *others = calibration_verdict(calibration)
     first = first.partition(": ")[2] or first
     return [f"{first[0].upper()}{first[1:]}", *others]
 
 
 def wrong_on_purpose(provenance: Provenance) -> list[str]:
-    """Whether captures were simulated by something else than what was fitted."""
+    """Return whether the simulating model differs from the fitted model."""
     differing = [one_line(str(name)) for name in provenance.get("truth") or {}]
     if not differing:
         return []
     return [
         "What captures were simulated by differs on purpose from what was fitted, in its "
-        f"{join(differing)}: this calibration asks whether that mistake is seen."
+        f"{join(differing)}: this calibration tests whether that mistake is detected."
     ]
 
 
 def interval_sentences(table: pd.DataFrame, titles: Mapping[str, str]) -> list[str]:
-    """Coverage of the 95% intervals of parameters that fail the test, and failed fits."""
+    """State coverages of 95% intervals of parameters that fail, and failed fits."""
     failing = table[~(p_values(table) >= significance_level(table)).all(axis=1)]
     sentences = []
     if len(failing):
@@ -648,7 +649,7 @@ def interval_sentences(table: pd.DataFrame, titles: Mapping[str, str]) -> list[s
 
 
 def reference_sentence(result: Study) -> str:
-    """What the reference is, and how accurate it is."""
+    """State what the reference is, and how accurate it is."""
     view = accuracy_view(result)
     study = view.study.attrs
     sentence = (
@@ -656,4 +657,4 @@ def reference_sentence(result: Study) -> str:
         f"effective sample size of {study['reference_ess']:,.0f}; its own Monte Carlo "
         f"error is at most {study['reference_error']:.2g} posterior sd."
     )
-    return f"{sentence} Against it speaks: {view.doubts}." if view.doubts else sentence
+    return f"{sentence} There are doubts about it: {view.doubts}." if view.doubts else sentence

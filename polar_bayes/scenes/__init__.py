@@ -1,4 +1,4 @@
-"""Which scene a capture calls for: candidate scenes, their comparison, and stacked posteriors."""
+"""Scenes for a capture: candidates, their comparison, and stacked posteriors."""
 
 from polar_bayes.namespace import attach
 

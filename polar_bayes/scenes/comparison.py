@@ -59,23 +59,23 @@ from polar_bayes.scenes.neighbors import suits_index
 from polar_bayes.scenes.sentences import SceneComparison, is_apart
 
 METHOD = Importance(draws=2048, rounds=12)
-"""Of the fits that are compared. Most take few rounds; posteriors that are curved in many
+"""Method of the fits that are compared. Most take few rounds; posteriors that are curved in many
 parameters take all, where chains would take minutes."""
 
 MAX_FITS = 12
-"""Candidates that forward selection fits at most."""
+"""Largest number of candidates that forward selection fits."""
 
 MAX_ALTERNATIVES = 4
-"""Alternatives that are fitted besides at most: those with other slopes or bodies come first."""
+"""Largest number of additional alternatives; other slopes and bodies come first."""
 
 TIME_WAS_UP = "the time was up"
-"""Why a scene was not fitted within the seconds of a comparison."""
+"""Reason for not fitting a scene within the seconds of a comparison."""
 
 LEAST_WEIGHT = 0.05
-"""Stacking weight below which a scene does not remain."""
+"""Stacking weight below which a scene is excluded."""
 
 BOOTSTRAPS, EM_STEPS = 400, 300
-"""Of stacking weights: replicates of the Bayesian bootstrap, and steps of each optimization."""
+"""Replicates of the Bayesian bootstrap of stacking weights, and steps of each optimization."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ class _Fit:
 
     @property
     def is_contradicted(self) -> bool:
-        """Whether the parameters are where their priors hardly allow them."""
+        """True if parameters lie where their priors have almost no probability."""
         return self.findings.get("priors") == "problem"
 
 
@@ -166,7 +166,7 @@ def compare_scenes(
 
 
 def compare_candidates(arguments: "FitArguments", progress: Progress) -> SceneComparison:
-    """Compare the scenes that the capture allows, as far as its readings call for them."""
+    """Compare the scenes that the capture allows, until readings need no more parts."""
     library = scene_library(arguments.capture, arguments.variables)
     simplest = library.scene(library.simplest)
     fringes = "wavelength" in arguments.capture.coords
@@ -184,7 +184,7 @@ def compare_candidates(arguments: "FitArguments", progress: Progress) -> SceneCo
 
 
 def lifted_prior(arguments: "FitArguments", scene: Scene) -> dict[str, dist.Distribution]:
-    """A prior for the index that Brewster's angle by eye means, where the default excludes it."""
+    """Return a prior that includes the index by Brewster's angle if the default does not."""
     # A scene could otherwise win by bending the optics until the index is one that is allowed.
     by_eye = indices_by_eye(arguments.capture)
     if not any(by_eye.values()):
@@ -199,7 +199,7 @@ def lifted_prior(arguments: "FitArguments", scene: Scene) -> dict[str, dist.Dist
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FitArguments:
-    """What all candidates have in common: the arguments of a fit but scene and method."""
+    """Arguments that the fits of all candidates share: all except scene and method."""
 
     capture: xr.Dataset
     model: str | Callable
@@ -212,7 +212,7 @@ class FitArguments:
     scene_parameters: frozenset[str] = frozenset()
     """Parameters that any of the scenes reads."""
     seconds: float | None = None
-    """Wall time of the comparison; None: as long as it takes."""
+    """Limit of the comparison's wall time, in seconds; None: no limit."""
     begun: float = dataclasses.field(default_factory=time.perf_counter)
 
     def __post_init__(self) -> None:
@@ -222,12 +222,12 @@ class FitArguments:
 
     @property
     def deadline(self) -> float:
-        """When the comparison ends, by `time.perf_counter`."""
+        """End of the comparison, by `time.perf_counter`."""
         return math.inf if self.seconds is None else self.begun + self.seconds
 
     @property
     def chosen_links(self) -> AbstractLink | Mapping[str, AbstractLink] | None:
-        """The links given, or those that a capture without a suitable set-up calls for."""
+        """The given links, or links for a capture without a suitable set-up."""
         return default_links(self.capture) if self.links is None else self.links
 
     @property
@@ -240,16 +240,16 @@ class FitArguments:
         return set(names) & set(self.capture)
 
     def among(self, scenes: Iterable[Scene]) -> "FitArguments":
-        """The same, for these scenes."""
+        """Return the arguments for these scenes."""
         names = frozenset(name for scene in scenes for name in scene.parameters)
         return dataclasses.replace(self, scene_parameters=names)
 
     def with_priors(self, priors: Mapping[str, dist.Distribution]) -> "FitArguments":
-        """The same, with these priors in the place of others."""
+        """Return the arguments with these priors added or replaced."""
         return dataclasses.replace(self, priors={**(self.priors or {}), **priors} or None)
 
     def request(self, scene: Scene) -> Request:
-        """The request for one scene; a prior for a parameter that only others read is not used."""
+        """Return the request of one scene, without priors that only other scenes read."""
         others = self.scene_parameters - set(scene.parameters)
         own = {name: prior for name, prior in (self.priors or {}).items() if name not in others}
         asked = self.capture, self.model, scene, own or None, self.chosen_links
@@ -258,7 +258,7 @@ class FitArguments:
 
 
 class _Fits:
-    """The candidates that were fitted, by name."""
+    """Fitted candidates, by name."""
 
     def __init__(self, arguments: FitArguments, progress: Progress) -> None:
         self.arguments, self.progress = arguments, progress
@@ -267,11 +267,11 @@ class _Fits:
 
     @property
     def count(self) -> int:
-        """Candidates that were tried."""
+        """Number of candidates that were tried."""
         return len(self.done) + len(self.failed)
 
     def add_all(self, scenes: Mapping[str, Scene], most: int) -> None:
-        """Fit candidates, of which at most so many are tried in all."""
+        """Fit candidates until a total number of them has been tried."""
         requests = {name: self.arguments.request(scene) for name, scene in scenes.items()}
         waiting = list(requests.values())
         for number, name in enumerate(requests):
@@ -291,7 +291,7 @@ class _Fits:
 
 
 def _fitted(name: str, requests: list[Request], stage: str, share: float, report: Progress) -> _Fit:
-    """The fit of the first request, with its predictions and criticism."""
+    """Return the fit of the first request, with predictions and criticism."""
     for each in requests:
         _begin_to_compile(each)  # the next one while this one runs
     begun, request = time.perf_counter(), requests[0]
@@ -322,7 +322,7 @@ def _fitted(name: str, requests: list[Request], stage: str, share: float, report
 
 
 def _index_bound(fit: FitView) -> float:
-    """The bound of its prior at which an interval of the index ends; NaN where none does."""
+    """Return the prior bound at which an interval of the index ends; NaN if none."""
     for scalar in fit.scalars:
         if scalar.name in INDICES:
             ends = np.quantile(scalar.draws, CENTRAL_95)
@@ -333,7 +333,7 @@ def _index_bound(fit: FitView) -> float:
 
 
 def _begin_to_compile(request: Request) -> None:
-    """Trace the programs of a fit now, and compile them on another thread."""
+    """Trace the programs of a fit now, and compile them in another thread."""
     with contextlib.suppress(FitError):  # told when the fit is done
         problem = make_problem(request, jax.random.key(request.seed))
         METHOD.prepare(problem)
@@ -341,7 +341,7 @@ def _begin_to_compile(request: Request) -> None:
 
 
 def _checked(scenes: Mapping[str, Scene]) -> Mapping[str, Scene]:
-    """The scenes of a caller, refused where they are none."""
+    """Return the caller's scenes; refuse anything else."""
     hint = "give scenes by name, such as {'mirror': Scene(SmoothSurface())}, or leave it out"
     if not isinstance(scenes, Mapping) or not scenes:
         raise FitError("there is nothing to compare", where="compare_scenes: scenes", hint=hint)
@@ -354,7 +354,7 @@ def _checked(scenes: Mapping[str, Scene]) -> Mapping[str, Scene]:
 
 
 def _select(fits: _Fits, library: SceneLibrary) -> None:
-    """Forward selection, then the alternatives to what was selected."""
+    """Run forward selection, then fit the alternatives to the selected scene."""
     best = library.simplest
     _fit_choices(fits, library, [best])
     looked_at_alternatives = False
@@ -380,7 +380,7 @@ def _select(fits: _Fits, library: SceneLibrary) -> None:
 
 
 def _choose_layers(fits: _Fits, *, fringes: bool) -> tuple[list[str], list[str]]:
-    """Scenes that may remain, by whether they have a layer, and layers that are not decided.
+    """Return scenes that remain, with or without a layer, and undecided layers.
 
     Systematic errors stand in for layers, so that layers are tried without them. A film makes the
     index that of the body below it, so that it has to be told apart from none.
@@ -426,7 +426,7 @@ def _choose_layers(fits: _Fits, *, fringes: bool) -> tuple[list[str], list[str]]
 def _fit_choices(
     fits: _Fits, library: SceneLibrary, choices: Iterable[Choice], most: int | None = None
 ) -> None:
-    """Fit what was not tried yet, until so many candidates were tried in all."""
+    """Fit choices that were not tried yet, up to a total number."""
     most = MAX_FITS if most is None else most
     tried = {*fits.done, *fits.failed}
     new = {name: choice for choice in choices if (name := name_of(choice)) not in tried}
@@ -435,7 +435,7 @@ def _fit_choices(
 
 
 def _better(fits: _Fits, best: Choice, choices: Iterable[Choice]) -> Choice | None:
-    """Of some choices the one that predicts best, where it is to replace the best so far."""
+    """Return the best-predicting choice that should replace the current best, if any."""
     fitted = [choice for choice in choices if name_of(choice) in fits.done]
     if not fitted:
         return None
@@ -449,7 +449,7 @@ def _better(fits: _Fits, best: Choice, choices: Iterable[Choice]) -> Choice | No
 
 
 def _is_worse(fits: _Fits, best: Choice, choice: Choice) -> bool:
-    """Whether a choice is told apart from the best so far, and predicts worse."""
+    """Return whether a choice predicts significantly worse than the current best."""
     if not {name_of(best), name_of(choice)} <= fits.done.keys():
         return False
     gain, error = _gain(fits.done[name_of(choice)], fits.done[name_of(best)])
@@ -457,13 +457,13 @@ def _is_worse(fits: _Fits, best: Choice, choice: Choice) -> bool:
 
 
 def _gain(one: _Fit, other: _Fit) -> tuple[float, float]:
-    """By how much one fit predicts better than another, and the error of that. Unit nat."""
+    """Return the gain in elpd of one fit over another, and its standard error, in nats."""
     gain = one.pointwise - other.pointwise
     return float(gain.sum()), float(np.sqrt(gain.size * gain.var()))
 
 
 def name_of(choice: Choice) -> str:
-    """Name of a choice: its parts."""
+    """Return the name of a choice, made of its parts."""
     return " + ".join(filter(None, choice))
 
 
@@ -506,7 +506,7 @@ def _comparison(
 
 
 def _predictions(fits: Mapping[str, _Fit]) -> pd.DataFrame:
-    """Leave-one-out predictions of each fit, best first."""
+    """Return leave-one-out predictions of each fit, best first."""
     columns = ["elpd", "se", "elpd_diff", "dse", "weight", "unreliable"]
     if len(fits) == 1:
         ((name, fit),) = fits.items()
@@ -527,7 +527,7 @@ def _predictions(fits: Mapping[str, _Fit]) -> pd.DataFrame:
 def _remaining(
     fits: Mapping[str, _Fit], table: pd.DataFrame, allowed: Container[str] | None
 ) -> list[str]:
-    """Scenes that are not told apart from the best, and that their priors allow if any are."""
+    """Return scenes not significantly worse than the best that priors allow, if any."""
     apart = is_apart(table["elpd_diff"].abs(), table["dse"])
     near = [str(name) for name in table.index[~apart] if allowed is None or name in allowed]
     near = near or [next(str(name) for name in table.index if name in (allowed or fits))]
@@ -536,7 +536,7 @@ def _remaining(
 
 
 def stacking_weights(pointwise: np.ndarray) -> np.ndarray:
-    """Stacking weights (scene,) of elpd (reading, scene), averaged over the Bayesian bootstrap."""
+    """Return stacking weights (scene,) of elpd (reading, scene), by Bayesian bootstrap."""
     # The optimum alone is often a corner: of two scenes that predict alike it takes one.
     readings, scenes = pointwise.shape
     density = np.exp(pointwise - pointwise.max(axis=1, keepdims=True))
@@ -548,7 +548,7 @@ def stacking_weights(pointwise: np.ndarray) -> np.ndarray:
 
 
 def _intervals(fits: Mapping[str, FitView]) -> pd.DataFrame:
-    """Material parameters of each fit."""
+    """Return the material parameters of each fit."""
     rows: dict[tuple[str, str], Any] = {}
     for name, fit in fits.items():
         for scalar in fit.scalars:
@@ -564,7 +564,7 @@ def _intervals(fits: Mapping[str, FitView]) -> pd.DataFrame:
 
 
 def between_scenes(intervals: pd.DataFrame, weights: pd.Series) -> pd.Series:
-    """Share of the variance between scenes, by the law of total variance."""
+    """Return the share of variance between scenes, by the law of total variance."""
     remaining = weights[weights > 0.0]
     found = {}
     for label in dict.fromkeys(intervals.index.get_level_values(0)):

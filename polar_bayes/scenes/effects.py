@@ -1,4 +1,4 @@
-"""Choice of effects: those of a full scene that one capture can see; the others are left out.
+"""Choice of effects: a full scene without the effects that a capture cannot show.
 
 Each effect is left out alone, then all that change little are left out together (backward
 elimination); while together they change too much, the effect that alone changes most is restored.
@@ -40,7 +40,7 @@ from polar_bayes.scenes.posterior_change import Baseline, PosteriorChange, Scene
 def find_forced(
     effects: Sequence[Effect], keep: str | Iterable[str], drop: str | Iterable[str]
 ) -> tuple[list[Effect], list[Effect]]:
-    """The effects that the user decided to keep, and to drop."""
+    """Return the effects that the user requests to keep, and to drop."""
 
     def find(names: str | Iterable[str], where: str) -> list[Effect]:
         names = (names,) if isinstance(names, str) else names
@@ -50,19 +50,19 @@ def find_forced(
     for effect in dropped:
         if effect in kept:
             raise SceneError(
-                "it is both to keep and to drop", where=effect.name, hint="name it in one only"
+                "the effect is in both keep and drop", where=effect.name, hint="remove it from one"
             )
     return kept, dropped
 
 
 class EffectSelection:
-    """What changes without each effect alone, and the scene with the effects that are kept."""
+    """Changes by leaving out each effect, and the scene with the effects that are kept."""
 
     scene: Scene
     selected_from: Baseline
-    """The full scene without the effects that the user drops: the selected one is judged by it."""
+    """Full scene without the effects that the user drops: the reference of comparisons."""
     combined: PosteriorChange
-    """Of the selected scene."""
+    """Change of the posterior by the selected scene."""
 
     def __init__(
         self,
@@ -90,11 +90,11 @@ class EffectSelection:
         self.reasons: dict[Effect, str] = {}
 
     def change(self, effect: Effect) -> float:
-        """The largest change of a judged parameter without the effect."""
+        """Return the largest change of a judged parameter without the effect."""
         return self.baseline.largest_change(self.changes[effect])
 
     def select(self, keep: Sequence[Effect], drop: Sequence[Effect]) -> None:
-        """Leave out together all effects that change little, and those that the user drops."""
+        """Leave out all effects that change little, and those that the user drops."""
         forced = [options[0] for options in self._by_key_path(drop).values()]
         baseline = self._without(forced)
         forced_paths = {effect.key_path for effect in forced}
@@ -114,7 +114,9 @@ class EffectSelection:
                 break
             worst = max(optional, key=self.change)
             options[worst.key_path].remove(worst)
-            remarks[worst] = f"with all others that could go, {baseline.describe(combined)}"
+            remarks[worst] = (
+                f"without all other effects that may be dropped, {baseline.describe(combined)}"
+            )
         self.scene, self.selected_from, self.combined = scene, baseline, combined
         dropped = {effect.key_path: effect for effect in (*forced, *optional)}
         left = [part for _, part in parts_of(scene)]
@@ -125,11 +127,11 @@ class EffectSelection:
             if not remark and instead not in (None, effect):
                 remark = f"{instead.name} instead"
             elif not remark and instead is None and not self.kept[effect]:
-                remark = "it goes with the part around it"
+                remark = "it is removed with the part that contains it"
             self.reasons[effect] = self._reason(effect, remark)
 
     def _without(self, forced: list[Effect]) -> Baseline:
-        """The baseline without the effects that the user drops."""
+        """Return the baseline without the effects that the user drops."""
         if not forced:
             return self.baseline
         bare = simplify(self.full, forced)
@@ -139,7 +141,7 @@ class EffectSelection:
         return dataclasses.replace(self.baseline, fit=fit)
 
     def _by_key_path(self, effects: Iterable[Effect]) -> dict[KeyPath, list[Effect]]:
-        """Effects by the key path of their part, the replacement of fewest operations first."""
+        """Group effects by the path of their part, replacements with fewest operations first."""
 
         def operations(effect: Effect) -> float:
             return self.densities.density(effect.apply(self.full)).operations
@@ -150,18 +152,18 @@ class EffectSelection:
         return groups
 
     def _removes_any(self, effect: Effect, keep: Sequence[Effect]) -> bool:
-        """Whether leaving out the effect would remove a part that is to be kept."""
+        """Return whether leaving out the effect would remove a part that is to be kept."""
         rest = [part for _, part in parts_of(effect.apply(self.full))]
         return any(kept.part not in rest for kept in keep)
 
     def _reason(self, effect: Effect, remark: str) -> str:
-        """Why an effect is kept or dropped: the remark, the change, the parameters that it adds."""
+        """Explain why an effect is kept or dropped."""
         change, is_kept = self.change(effect), self.kept[effect]
         found = self.baseline.describe(self.changes[effect])
         if change <= self.tolerance:
             which = "parameter" if self.baseline.names is None else "judged parameter"
             found = f"alone no {which} changes by more than {max(change, 0.001):.2g} sd"
-            remark = remark or ("a part of it stays by your choice" if is_kept else "")
+            remark = remark or ("a part inside it is kept by your choice" if is_kept else "")
         missing = [] if is_kept else self.baseline.missing(self.changes[effect])
         unfitted = f"not fitted then: {', '.join(missing)}" if missing else ""
         return "; ".join(text for text in (remark, found, unfitted) if text)
@@ -193,14 +195,14 @@ DESCRIPTIONS: Mapping[str, tuple[str, str]] = {
 def make_ledger(
     selection: EffectSelection, forced: Sequence[Effect], settings: Mapping[str, str | float | int]
 ) -> xr.Dataset:
-    """Changes, costs and the selection as one dataset."""
+    """Combine changes, costs and selection into one dataset."""
     full, costs = selection.full, selection.densities.costs()
     effects, changes = tuple(selection.changes), tuple(selection.changes.values())
     labels = selection.baseline.fit.density.labels
     shape = (len(effects), len(labels))
 
     def of_all_labels(values: np.ndarray) -> list[float]:
-        """NaN for parameters that the user dropped."""
+        """Insert NaN for parameters that the user dropped."""
         known = dict(zip(selection.selected_from.fit.density.labels, values, strict=True))
         return [known.get(label, math.nan) for label in labels]
 
@@ -249,7 +251,7 @@ def _texts(texts: Iterable[str]) -> np.ndarray:
 
 
 def ledger_table(ledger: xr.Dataset) -> pd.DataFrame:
-    """One row for each effect, as text.
+    """Return one row for each effect, as text.
 
     `data` is the largest move of a reading [noise sd]; `shift` [posterior sd] and `sd` are the
     largest changes of a judged parameter; `operations` and `time` are shares of the full scene's.
@@ -271,7 +273,7 @@ def ledger_table(ledger: xr.Dataset) -> pd.DataFrame:
 
 
 def ledger_sentences(ledger: xr.Dataset) -> list[str]:
-    """How many effects are kept, what leaving out the others changes, and what it saves."""
+    """State how many effects are kept, and what leaving out the others changes and saves."""
     kept, forced = (ledger[name].to_numpy().astype(bool) for name in ("kept", "forced"))
     if not kept.size:
         return ["The scene has no effect that could be left out."]
@@ -292,7 +294,7 @@ def ledger_sentences(ledger: xr.Dataset) -> list[str]:
 
 
 def ledger_summary(ledger: xr.Dataset) -> dict[str, Any]:
-    """The ledger as JSON can hold it; what is not finite becomes None.
+    """Return the effects table in types of JSON; values that are not finite become None.
 
     Args:
         ledger: A ledger.
@@ -320,13 +322,13 @@ def ledger_summary(ledger: xr.Dataset) -> dict[str, Any]:
 
 
 def _json_value(value: Any) -> Any:
-    """NumPy numbers as Python's own, and None for what is not finite."""
+    """Convert NumPy numbers to Python's, and values that are not finite to None."""
     value = value.item() if isinstance(value, np.generic) else value
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _largest(values: np.ndarray, form: str) -> str:
-    """The finite value farthest from 0 as text."""
+    """Format the finite value farthest from 0."""
     known = values[np.isfinite(values)]
     return f"{known[np.argmax(np.abs(known))]:{form}}" if known.size else "-"
 
@@ -341,7 +343,7 @@ def _share(part: float, whole: float) -> str:
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ChosenScene(Scene):
-    """A scene with the ledger of the effects that it was chosen by.
+    """A scene with the table of effects from which it was chosen.
 
     It is used as any other scene. A fit keeps the ledger in its group `effects`; a scene made from
     it by `dataclasses.replace` has none, because the ledger would no longer be true of it.
@@ -350,7 +352,7 @@ class ChosenScene(Scene):
     ledger: xr.Dataset | None = dataclasses.field(  # type: ignore[misc]
         default=None, init=False, compare=False, repr=False
     )
-    """What each effect changes and costs; `polar_bayes.scenes.effects` says how to read it."""
+    """Changes and costs of each effect; `polar_bayes.scenes.effects` explains them."""
 
     @override
     def __repr__(self) -> str:
@@ -373,7 +375,7 @@ def choose_effects(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> ChosenScene:
-    """Keep of a scene what this capture can see.
+    """Choose the effects of a scene that this capture can show.
 
     Each effect is left out alone. It may go if no parameter then moves by more than `tolerance`
     posterior standard deviations, and none changes its standard deviation by more than that share.

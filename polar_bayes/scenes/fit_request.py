@@ -1,4 +1,4 @@
-"""One capture and one scene in, an ArviZ DataTree out."""
+"""The steps of one fit: from a capture and a scene to an ArviZ DataTree."""
 
 import dataclasses
 import inspect
@@ -37,10 +37,10 @@ from polar_bayes.scenes.neighbors import STOPPED, fit_comparisons, removed_terms
 PRIOR_DRAWS = 500
 
 DIAGNOSTICS = ("r_hat", "pareto_k", "ess")
-"""What a method states of its own draws, stored with the result; None where it states nothing."""
+"""Diagnostics that methods state of their draws and results store; None if not stated."""
 
 Keep = Callable[[xr.DataTree], None]
-"""Called with a fit before what is only compared with it."""
+"""Function of a fit that is called before comparisons with the fit are made."""
 
 
 def fit_request(
@@ -52,7 +52,7 @@ def fit_request(
     with_comparisons: bool = True,
     keep: Keep | None = None,
 ) -> xr.DataTree:
-    """The fit of a request, in the precision that is switched on."""
+    """Fit a request in the current precision."""
     keys = compiled(_keys)(np.uint32(request.seed))
     key_search, key_draws, key_check, key_comparisons, key_posterior, key_prior = keys
     problem = make_problem(request, key_search, start_time)
@@ -117,7 +117,7 @@ def fit_request(
 
 
 def _keys(seed: Array) -> tuple[Array, ...]:
-    """Of the search, the draws, their check, the comparisons, and both predictions."""
+    """Split a key for search, draws, check, comparisons and both predictions."""
     key, comparisons, posterior, prior = jax.random.split(jax.random.key(seed), 4)
     return (*jax.random.split(key), jax.random.fold_in(key, 1), comparisons, posterior, prior)
 
@@ -125,7 +125,7 @@ def _keys(seed: Array) -> tuple[Array, ...]:
 def choose_method(
     method: str | AbstractMethod, tolerance: float | None, seconds: float | None
 ) -> AbstractMethod:
-    """The settings that a caller asks for, by name or as they are."""
+    """Return the settings of the caller's method, given by name or as a value."""
     limits = {"tolerance": tolerance, "seconds": seconds}
     given = {name: value for name, value in limits.items() if value is not None}
     if given and method != "auto":
@@ -140,7 +140,7 @@ def choose_method(
 
 
 def _check_room(problem: Problem, draws: int) -> None:
-    """Refuse predictions of more draws than the memory can hold."""
+    """Refuse predictions of more draws than fit into memory."""
     data = problem.data
     readings = len(problem.program.observed) * problem.dtype.itemsize * math.prod(data.shape)
     # Noise-free readings, predicted ones and the density of each; in blocks, then all of them.
@@ -148,14 +148,14 @@ def _check_room(problem: Problem, draws: int) -> None:
 
 
 def _model_settings(model: Callable) -> Provenance:
-    """The fields of a model that is a value, in what JSON can hold."""
+    """Return the fields of a model that is a dataclass, in types of JSON."""
     if not dataclasses.is_dataclass(model) or isinstance(model, type):
         return {}
     return json.loads(json.dumps(dataclasses.asdict(model), default=repr))
 
 
 def _model_source(model: Callable) -> str:
-    """The source of a model of the user's own, so that a result shows what was fitted."""
+    """Return the source of the user's model, so that a result shows what was fitted."""
     while isinstance(model, Messenger):
         model = model.fn
     code = model if isinstance(model, FunctionType) else type(model)
@@ -168,12 +168,12 @@ def _model_source(model: Callable) -> str:
 
 
 def _finite_bounds(prior: dist.Distribution) -> list[float | None]:
-    """Where the support of a prior ends; None, which JSON can hold, where it does not."""
+    """Return the bounds of the support of a prior; None for infinite ones."""
     return [bound if math.isfinite(bound) else None for bound in support_bounds(prior)]
 
 
 def _prior_probability(request: Request, posterior: Values) -> dict[str, list[float]]:
-    """Prior probability below each posterior median, where a prior has such a function."""
+    """Return prior probabilities below posterior medians, for priors that have them."""
     found = {}
     for name, prior in request.priors.items():
         if name in posterior and name not in request.fixed:
@@ -184,7 +184,7 @@ def _prior_probability(request: Request, posterior: Values) -> dict[str, list[fl
 
 
 def _known(request: Request, problem: Problem) -> dict[str, float]:
-    """Standard deviations of the priors of the instrument's parameters that are one number."""
+    """Return standard deviations of the priors of scalar parameters of the instrument."""
     terms = (each for each in request.scene.terms if not isinstance(each, Discrepancy))
     names = parameters_of(*terms)
     priors = {name: request.priors[name] for name in names if name in problem.program.supports}
@@ -193,7 +193,7 @@ def _known(request: Request, problem: Problem) -> dict[str, float]:
 
 
 def _indices_by_eye(request: Request) -> dict[str, list[float]]:
-    """Index by eye of each material; none where a coat or polarized light moves the peak."""
+    """Return the index by eye of each material; empty where coats or light move the peak."""
     source = getattr(request.scene.surface, "illumination", None)
     if request.scene.coat is not None or getattr(source, "polarization", None) is not None:
         return {}
@@ -202,7 +202,7 @@ def _indices_by_eye(request: Request) -> dict[str, list[float]]:
 
 
 def _provenance(request: Request, method: AbstractMethod, problem: Problem) -> Provenance:
-    """Everything that is needed to repeat the fit."""
+    """Return everything that is needed to repeat the fit."""
     data = problem.data
     at_boundary = {
         name: int(np.sum((np.asarray(link.reading(x)) != np.asarray(x)) & np.asarray(data.valid)))

@@ -1,4 +1,4 @@
-"""The public verb of one capture: by one scene, or by those that remain of a comparison."""
+"""The verb `fit`: one capture by one scene, or by the scenes that a comparison selects."""
 
 import time
 from collections.abc import Callable, Mapping

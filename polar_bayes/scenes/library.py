@@ -1,4 +1,4 @@
-"""Candidate scenes: the parts that the variables and the geometry of a capture allow.
+"""Candidate scenes: parts that the variables and the geometry of a capture allow.
 
 A candidate takes one option of each slot: a surface with its source, a body or none, the systematic
 errors of the instrument or none, and so on. Systematic errors are one option together: an unknown
@@ -31,7 +31,7 @@ from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 from polar_bayes.setups import SETUPS, Setup, is_mirrored
 
 Choice = tuple[str, ...]
-"""The option of each slot, by name; "" where the slot stays empty."""
+"""Option of each slot, by name; "" for an empty slot."""
 
 SURFACES: Mapping[str, Any] = MappingProxyType(
     {
@@ -42,7 +42,7 @@ SURFACES: Mapping[str, Any] = MappingProxyType(
     }
 )
 OTHER_SLOPES = MappingProxyType({"rough surface": "rough GGX surface"})
-"""Surfaces that differ in their slopes alone; the second is an alternative, never an extension."""
+"""Surfaces that differ only in their slopes; the second is an alternative, not an extension."""
 BODIES: Mapping[str, Any] = MappingProxyType(
     {
         "unpolarized body": Unpolarized(),
@@ -54,7 +54,7 @@ BODIES: Mapping[str, Any] = MappingProxyType(
 
 @dataclasses.dataclass(frozen=True)
 class SceneLibrary:
-    """The options of each slot for one capture, the simplest first.
+    """Options of each slot for one capture, the simplest first.
 
     Args:
         surfaces: Surfaces with their sources, by name.
@@ -71,11 +71,11 @@ class SceneLibrary:
 
     @property
     def simplest(self) -> Choice:
-        """The first surface and nothing else."""
+        """The first surface without any other option."""
         return (next(iter(self.surfaces)), "", *("" for _ in self.others))
 
     def scene(self, choice: Choice) -> Scene:
-        """The scene of a choice.
+        """Return the scene of a choice.
 
         Args:
             choice: The option of each slot: surface, body, then those of `others`.
@@ -93,7 +93,7 @@ class SceneLibrary:
         )
 
     def single_parts(self) -> Iterator[Scene]:
-        """Scenes that together have every option.
+        """Return scenes that together contain every option.
 
         Yields:
             The simplest scene with each option in turn.
@@ -106,7 +106,7 @@ class SceneLibrary:
                 yield self.scene(tuple(choice))
 
     def extensions(self, choice: Choice) -> Iterator[Choice]:
-        """Choices with one part more, or with another surface.
+        """Return choices with one part more, or with another surface.
 
         Args:
             choice: The option of each slot.
@@ -125,7 +125,7 @@ class SceneLibrary:
                 yield (surface, *choice[1:])
 
     def other_bodies(self, choice: Choice) -> Iterator[Choice]:
-        """Choices with another body in the place of the one that there is.
+        """Return choices with another body in place of the present one.
 
         Args:
             choice: The option of each slot.
@@ -137,7 +137,7 @@ class SceneLibrary:
             yield from ((choice[0], body, *choice[2:]) for body in self.bodies if body != choice[1])
 
     def alternatives(self, choice: Choice) -> Iterator[Choice]:
-        """Choices with other slopes or another body, with one part less, or with another surface.
+        """Return choices with other slopes, body or surface, or with one part less.
 
         Args:
             choice: The option of each slot.
@@ -156,7 +156,7 @@ class SceneLibrary:
 
 
 def scene_library(capture: xr.Dataset, variables: Collection[str] | None = None) -> SceneLibrary:
-    """The parts that a capture allows.
+    """Return the parts that a capture allows.
 
     A mirror needs views in the mirror direction of the light; a rough surface under a point source
     in that direction sends the polarization of the mirror, so that it needs a fitted brightness. A
@@ -193,7 +193,7 @@ def scene_library(capture: xr.Dataset, variables: Collection[str] | None = None)
 
 
 def named_setup(capture: xr.Dataset) -> Setup | None:
-    """The set-up that a capture names, where its links suit what the capture holds."""
+    """Return the set-up that a capture names, if its links suit the capture."""
     setup = SETUPS.get(str(capture.attrs.get("setup")))
     if setup is None:
         return None
@@ -208,7 +208,7 @@ def named_setup(capture: xr.Dataset) -> Setup | None:
 
 
 def default_links(capture: xr.Dataset) -> Mapping[str, AbstractLink] | None:
-    """Links of a capture that names no set-up that suits it; None where it names one."""
+    """Return links for a capture that names no suitable set-up; None if it names one."""
     if named_setup(capture) is not None:
         return None
     links: dict[str, AbstractLink] = {
@@ -224,12 +224,12 @@ def default_links(capture: xr.Dataset) -> Mapping[str, AbstractLink] | None:
 
 
 def has_beam(capture: xr.Dataset) -> bool:
-    """Whether a capture states that its light is a beam, as that of a goniometer is."""
+    """Return whether a capture states that its light is a beam, as a goniometer's is."""
     return capture.attrs.get("setup") == "goniometer" or "incident_levels" in capture.attrs
 
 
 def _bodies(setup: Setup | None, shows_absorption: bool) -> Mapping[str, Any]:
-    """The body of the set-up first; `Depolarizer` only where its absorption may show."""
+    """Return bodies, the set-up's first; `Depolarizer` only if its absorption may show."""
     first = setup.scene.subsurface if setup else Lambertian()
     order = sorted(BODIES, key=lambda name: BODIES[name] != first)
     return {
@@ -240,7 +240,7 @@ def _bodies(setup: Setup | None, shows_absorption: bool) -> Mapping[str, Any]:
 
 
 def _systematic_errors(setup: Setup | None) -> Instrument:
-    """The instrument terms of the set-up, an unknown angle zero and gains, and a discrepancy."""
+    """Return terms of the set-up, unknown angle zero and gains, and a discrepancy."""
     # The discrepancy vanishes at normal incidence: what is the same at all angles is a gain.
     given = setup.scene.terms if setup else ()
     kinds = (AngleZero, ChannelGain, Discrepancy)

@@ -1,4 +1,4 @@
-r"""What a fit is compared with: its scene without the instrument, and with other parts.
+r"""Comparisons of a fit: without instrument terms, and with alternative parts.
 
 The comparisons without terms of an instrument hold these at the values where they change nothing.
 
@@ -54,25 +54,26 @@ from polar_bayes.priors import INDICES, resolve_priors
 from polar_bayes.progress import Progress
 
 OTHER_STARTS, OTHER_SEARCHES = 100, 4
-"""Prior draws of several parameters that only an alternative has; searches from the likeliest."""
+"""Prior draws of parameters that only an alternative has; number of searches from the likeliest."""
 
 INDICES_UNDER: Mapping[str, tuple[tuple[float, float], ...]] = MappingProxyType(
     {"water film": ((1.333, 1.42),), "thin film": ((0.0, 1.4), (1.65, math.inf))}
 )
-"""Indices that a bare scene finds under a layer, which is not compared elsewhere: under water from
-those of bodies of 1.33 to 1.8. Few solids have one below 1.4 or above 1.65; a film gives them."""
+"""Ranges of the index that a bare scene finds under a layer; the layer is compared only there.
+Bodies of index 1.33 to 1.8 give these values under water. Few solids have an index below 1.4 or
+above 1.65, but films produce such values."""
 SLACK = 1.5
-"""Posterior sds by which an index may be beyond these."""
+"""Distance beyond these ranges, in posterior sds, at which a layer is still compared."""
 
 STOPPED = "it was stopped before it was done"
-"""Why a comparison is missing that somebody did not wait for."""
+"""Reason for a missing comparison that the user interrupted."""
 
 
 # --- The same scene without terms of its instrument -----------------------------------------------
 
 
 def removed_terms(request: Request) -> dict[str, list[AbstractInstrumentTerm]]:
-    """By name of a comparison, the terms of the instrument without which it fits."""
+    """Return the instrument terms that each comparison fit omits, by its name."""
     terms = request.scene.terms
     if not request.scene.has(Discrepancy):
         return {}
@@ -91,7 +92,7 @@ def fit_comparisons(
     key: Array,
     progress: Progress,
 ) -> tuple[dict[str, xr.Dataset], dict[str, str]]:
-    """Posteriors of the same capture with less of the instrument, and why others failed."""
+    """Fit the capture with less of the instrument; return posteriors and failures."""
     found: dict[str, xr.Dataset] = {}
     failed: dict[str, str] = {}
 
@@ -125,7 +126,7 @@ def fit_comparisons(
 def _first_trusted(
     methods: tuple[AbstractMethod, ...], problem: Problem, key: Array, progress: Progress
 ) -> np.ndarray:
-    """Draws of the first method that trusts enough of its own, or of the last."""
+    """Return draws of the first method that finds them reliable, or of the last."""
     for method in methods[:-1]:
         with contextlib.suppress(FitError):
             draws = method.run(problem, key, progress)
@@ -137,7 +138,7 @@ def _first_trusted(
 def _without(
     request: Request, problem: Problem, terms: list[AbstractInstrumentTerm]
 ) -> tuple[Problem, set[str]]:
-    """The problem without terms of the instrument, and the parameters that it does not have."""
+    """Return the problem without instrument terms, and the parameters that it lacks."""
     gone = {name for term in terms for name in term.parameters}
     neutral = {name: value for term in terms for name, value in term.neutral.items()}
     is_neutral = all(term.neutral or not term.parameters for term in terms)
@@ -174,7 +175,7 @@ def try_alternatives(
 
 
 def suits_index(layer: str, index: ArrayLike | None) -> bool:
-    """Whether draws of the index of a bare scene, (chain, draw, ...), may be those of a layer."""
+    """Return whether index draws of a bare scene, (chain, draw, ...), suggest a layer."""
     if index is None:
         return False
     draws = np.asarray(index)
@@ -194,7 +195,7 @@ def compare_alternatives(
     compared: Collection[Scene],
     progress: Progress,
 ) -> list[Provenance]:
-    """For each alternative its log Bayes factor and the answer that it gives, as JSON holds it.
+    """Return log Bayes factor and answer of each alternative in types of JSON.
 
     `shift` is the difference of the modes in posterior sds, by parameter. Scenes that were compared
     already are left out. A `FitError` where all coordinates together have no modes, as those of
@@ -260,7 +261,7 @@ def compare_alternatives(
 def _with_scene(
     request: Request, problem: Problem, modes: Modes, scene: Scene, key: Array
 ) -> tuple[DifferencedPotential, np.ndarray, np.ndarray]:
-    """The potential of another scene, and the modes and the covariance of this one as a guess."""
+    """Return the potential of another scene, and guesses of its modes and covariance."""
     new = [name for name in scene.parameters if name not in request.scene.parameters]
     priors = {**resolve_priors(new), **request.priors}
     other = dataclasses.replace(request, scene=scene, priors=priors, precision="double")
@@ -300,6 +301,6 @@ def _with_scene(
 
 
 def _log_evidence(potential: ValueAndGradient, modes: Modes) -> float:
-    """Laplace's approximation of the log evidence, summed over the modes."""
+    """Return Laplace's approximation of the log evidence, summed over the modes."""
     volume = 0.5 * np.linalg.slogdet(2.0 * math.pi * modes.covariance[0])[1]
     return float(volume - potential(modes.z[0])[0] - math.log(modes.weight[0]))

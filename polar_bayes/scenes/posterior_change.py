@@ -57,7 +57,7 @@ def compile_and_count(function: Callable, *arguments: object) -> tuple[Callable,
 def run_seconds(
     calls: Sequence[Callable[[], object]], *, rounds: int = 40, repeats: int = 3
 ) -> list[float]:
-    """Time of each call at its fastest, results awaited."""
+    """Return the shortest time of each call, including the wait for its result."""
 
     # The calls take turns, so that a machine that slows down slows them all alike; the fastest
     # round is the one that other programs disturbed least.
@@ -75,12 +75,12 @@ def run_seconds(
 
 
 Readings = Mapping[str, np.ndarray]
-"""One number for every reading, by variable."""
+"""Numbers for every reading, by variable."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SceneDensity:
-    """The log posterior density of one scene, compiled; labels and sites name its coordinates."""
+    """The compiled log posterior density of one scene, with labels of its coordinates."""
 
     program: Program
     data: Observations
@@ -95,15 +95,15 @@ class SceneDensity:
         return self.call(np.asarray(z), self.data)
 
     def potential(self, z: np.ndarray) -> float:
-        """Minus the log density of an unconstrained vector (size,), up to a constant."""
+        """Return minus the log density of an unconstrained vector (size,), up to a constant."""
         return float(self.evaluate(z)[0])
 
     def noise_free(self, z: np.ndarray) -> Readings:
-        """Predicted readings without noise."""
+        """Return predicted readings without noise."""
         return {name: np.asarray(values) for name, values in self.evaluate(z)[1].items()}
 
     def noise_sd(self, z: np.ndarray) -> Readings:
-        """Standard deviation of the noise of every reading."""
+        """Return the standard deviation of the noise of every reading."""
 
         def apply(function: Callable[[dist.Distribution], Array], names: Sequence[str]) -> Readings:
             def of_noise(z: Array, data: Observations) -> dict[str, Array]:
@@ -126,7 +126,7 @@ def _stated_sd(distribution: dist.Distribution) -> Array:
 
 
 def _quantile_sd(distribution: dist.Distribution) -> Array:
-    """Half the width of the central 68% of a thousand draws: the sd of normal noise."""
+    """Return half the width of the central 68% of draws: the sd of normal noise."""
     draws = distribution.sample(jax.random.key(0), (1000,))
     low, high = jnp.quantile(draws, jnp.asarray([0.1587, 0.8413]), axis=0)
     return 0.5 * (high - low)
@@ -153,12 +153,12 @@ def compile_density(request: Request, data: Observations) -> SceneDensity:
 
 
 FIRST_STEP, STEP = 1e-5, 1e-3
-"""Steps of differences: before the width of the posterior is known, and in units of it."""
+"""Steps of differences before the posterior width is known, and in units of it."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LaplaceFit:
-    """Laplace approximation of a posterior; `found` is False where the search did not converge."""
+    """Laplace approximation of a posterior; `found` is False if the search did not converge."""
 
     density: SceneDensity
     z: np.ndarray
@@ -172,7 +172,7 @@ class LaplaceFit:
 
 
 def fit_laplace(density: SceneDensity, key: Array, progress: Progress) -> LaplaceFit:
-    """The heaviest mode of a posterior, from prior draws."""
+    """Find the heaviest mode of a posterior from prior draws."""
     size = density.program.size
     starts = from_prior(density.program, key, 6, density.data)
     potential = _scaled_potential(density, np.zeros(size), np.eye(size), FIRST_STEP)
@@ -181,7 +181,7 @@ def fit_laplace(density: SceneDensity, key: Array, progress: Progress) -> Laplac
 
 
 def _refine(density: SceneDensity, z: np.ndarray, covariance: np.ndarray) -> LaplaceFit:
-    """Search the mode in coordinates in which the posterior is about standard normal."""
+    """Search the mode in coordinates in which the posterior is nearly standard normal."""
     for _ in range(2):  # the second search knows the width that the first has found
         factor = np.linalg.cholesky(covariance)
         potential = _scaled_potential(density, z, factor, STEP)
@@ -197,7 +197,7 @@ def _refine(density: SceneDensity, z: np.ndarray, covariance: np.ndarray) -> Lap
 def _scaled_potential(
     density: SceneDensity, origin: np.ndarray, factor: np.ndarray, step: float
 ) -> ValueAndGradient:
-    """Potential, and its gradient by central differences, of y in z = origin + factor y."""
+    """Return the potential and its differences in y, with z = origin + factor y."""
 
     def value_and_gradient(y: np.ndarray) -> tuple[float, np.ndarray]:
         z = origin + factor @ y
@@ -215,7 +215,7 @@ def _scaled_potential(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PosteriorChange:
-    """Changes of readings and posterior by another scene, per coordinate of the baseline."""
+    """Changes of readings and posterior by another scene, per coordinate."""
 
     fit: LaplaceFit
     largest_move: float
@@ -225,13 +225,13 @@ class PosteriorChange:
 
     @property
     def changes(self) -> np.ndarray:
-        """The larger of the shift and the change of the sd; NaN where it is not known."""
+        """Larger one of the shift and the change of the sd; NaN if unknown."""
         return np.fmax(np.abs(self.shift), np.abs(self.sd_ratio - 1.0))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Baseline:
-    """The scene that others are compared with; `names` are the judged parameters, None for all."""
+    """The scene with which others are compared; `names` are the judged parameters, None for all."""
 
     fit: LaplaceFit
     noise_sd: Readings
@@ -239,14 +239,14 @@ class Baseline:
 
     @property
     def judged(self) -> np.ndarray:
-        """For each coordinate, whether it is judged."""
+        """True for coordinates that are judged."""
         density = self.fit.density
         if self.names is None:
             return np.ones(len(density.labels), bool)
         return np.isin(density.labels, self.names) | np.isin(density.sites, self.names)
 
     def compare(self, other: SceneDensity) -> PosteriorChange:
-        """Replace the scene by another, whose mode is sought near that of this one."""
+        """Compare another scene, whose mode is searched near that of this one."""
         fit, sd = self.fit, self.fit.sd
         _, ours, theirs = np.intersect1d(fit.density.labels, other.labels, return_indices=True)
         start = np.zeros(len(other.labels))
@@ -264,7 +264,7 @@ class Baseline:
         return PosteriorChange(found, largest, rms, shift, sd_ratio)
 
     def _moves(self, other: SceneDensity, start: np.ndarray) -> np.ndarray:
-        """Changes of the predictions of all valid readings in units of their noise."""
+        """Return changes of predictions of valid readings in units of their noise."""
         # A sensor far beyond its full scale has no noise, and what it records does not move.
         before, after = self.fit.density.noise_free(self.fit.z), other.noise_free(start)
         valid = np.asarray(self.fit.density.data.valid)
@@ -275,7 +275,7 @@ class Baseline:
         return np.concatenate(rows)
 
     def largest_change(self, change: PosteriorChange) -> float:
-        """The largest change of a judged parameter; infinite where it is not known."""
+        """Return the largest change of a judged parameter; infinite if unknown."""
         # A parameter that the other scene lacks is not judged, unless the user named it.
         changes = change.changes[self.judged]
         missing = np.isnan(changes)
@@ -283,13 +283,13 @@ class Baseline:
         return np.inf if unknown or not change.fit.found else float(np.nanmax(changes))
 
     def describe(self, change: PosteriorChange) -> str:
-        """The largest change in words: `refractive_index[550] moves by +0.43 sd`."""
+        """Describe the largest change: `refractive_index[550] moves by +0.43 sd`."""
         if not change.fit.found:
             return "its posterior has no mode near that of the full scene"
         changes = np.where(self.judged, np.nan_to_num(change.changes, nan=-1.0), -1.0)
         most = int(np.argmax(changes))
         if changes[most] < 0.0:
-            return "it leaves nothing to judge"
+            return "no judged parameter is left without it"
         label = self.fit.density.labels[most]
         shift, widening = change.shift[most], change.sd_ratio[most] - 1.0
         if abs(shift) >= abs(widening):
@@ -297,7 +297,7 @@ class Baseline:
         return f"the sd of {label} changes by {widening:+.0%}"
 
     def missing(self, change: PosteriorChange) -> list[str]:
-        """Parameters that the other scene does not have."""
+        """Return parameters that the other scene does not have."""
         sites = np.asarray(self.fit.density.sites)
         present = set(sites[~np.isnan(change.changes)])
         return [name for name in dict.fromkeys(sites.tolist()) if name not in present]
@@ -315,7 +315,7 @@ class SceneDensities:
         self._densities: dict[Scene, SceneDensity] = {}
 
     def density(self, scene: Scene) -> SceneDensity:
-        """The density of a scene; a prior for a parameter that it lacks is not used."""
+        """Return the density of a scene, without priors for parameters it lacks."""
         if scene not in self._densities:
             table = PriorTable(self._priors)
             priors = {name: table.row(name) for name in self.names_read(scene)}
@@ -329,13 +329,13 @@ class SceneDensities:
         return inspect_model(request, self._data).priors
 
     def baseline(self, scene: Scene, parameters: tuple[str, ...] | None) -> Baseline:
-        """A scene to compare with."""
+        """Return a scene with its mode, to compare others with."""
         density = self.density(scene)
         fit = fit_laplace(density, jax.random.key(self._request.seed), self.progress)
         return Baseline(fit, density.noise_sd(fit.z), parameters)
 
     def costs(self) -> dict[Scene, dict[str, float]]:
-        """Operations, compile and run seconds of all scenes so far, timed in turns."""
+        """Return operations, compile and run seconds of all scenes so far, timed in turns."""
         calls = [
             functools.partial(density.evaluate, np.zeros(density.program.size))
             for density in self._densities.values()

@@ -47,7 +47,7 @@ from polar_bayes.setups import SETUPS, Setup, find_setup
 
 @functools.cache
 def _known(*packages: Any) -> Known:
-    """The classes of packages that a text may name."""
+    """Return the classes of packages that a text may name."""
     named = {name: getattr(each, name) for each in packages for name in each.__all__}
     return {n: x for n, x in named.items() if isinstance(x, type) and not n.startswith("Abstract")}
 
@@ -56,7 +56,7 @@ def _known(*packages: Any) -> Known:
 
 
 def parse_link(text: object, where: str) -> AbstractLink:
-    """The link that a text such as `StokesLink(degrees_of_freedom=4)` describes."""
+    """Return the link that a text such as `StokesLink(degrees_of_freedom=4)` describes."""
     found = parse_value(text, _known(links), where)
     if not isinstance(found, AbstractLink):
         raise FitError(f"{text!r} is no link", where=where, hint="give one such as BetaLink()")
@@ -64,12 +64,12 @@ def parse_link(text: object, where: str) -> AbstractLink:
 
 
 def parse_method(text: str, where: str) -> str | AbstractBatchMethod:
-    """The method that a text such as `Nuts(draws=2000)` describes; a name is returned as it is."""
+    """Return the method that a text such as `Nuts(draws=2000)` describes; names are unchanged."""
     return parse_value(text, _known(methods), where) if "(" in text else text
 
 
 def parse_scene(text: object, where: str) -> Scene:
-    """The scene that a text such as `Scene(surface=SmoothSurface())` describes."""
+    """Return the scene that a text such as `Scene(surface=SmoothSurface())` describes."""
     found = parse_value(
         text, _known(polar_bayes.physics, instrument, input_quantities), where, SceneError
     )
@@ -83,7 +83,7 @@ def parse_scene(text: object, where: str) -> Scene:
 
 
 def load_scene(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What a scene file states, as arguments of `polar_bayes.fit`.
+    """Read a scene file as arguments of `polar_bayes.fit`.
 
     Other functions take those that they have: `polar_bayes.identify` has no `method`.
 
@@ -111,7 +111,7 @@ def load_scene(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def arguments_of(result: xr.DataTree | xr.Dataset) -> dict[str, Any]:
-    """What a result was asked for, as `load_scene` has it.
+    """Return the arguments of the fit of a result, as `load_scene` returns them.
 
     Raises:
         SceneError: The result states no scene.
@@ -121,7 +121,7 @@ def arguments_of(result: xr.DataTree | xr.Dataset) -> dict[str, Any]:
 
 
 def _arguments(stated: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """What a scene file states, as arguments."""
+    """Parse the entries of a scene file as arguments."""
     _check_keys(stated, SCENE_KEYS, where)
     found: dict[str, Any] = {}
     if scene := _scene_of(stated, where):
@@ -143,7 +143,7 @@ def _arguments(stated: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def _scene_of(stated: Mapping[str, Any], where: str) -> str | Scene | Setup | None:
-    """The scene with its set-up, by name where it is that of the set-up."""
+    """Return the scene with its set-up, by name if the set-up has that scene."""
     base = stated.get("setup")
     setup = None if base is None else find_setup(base)
     texts = _table(stated, "scene", where)
@@ -192,7 +192,7 @@ def _check_keys(given: Iterable[str], known: Iterable[str], where: str) -> None:
 
 
 def scene_text(source: xr.DataTree | xr.Dataset | str) -> str:
-    """The scene file of a result or of a named set-up.
+    """Return the scene file of a result or of a named set-up as text.
 
     Args:
         source: A result of any kind, or a name in `polar_bayes.setups.SETUPS`.
@@ -260,5 +260,5 @@ def _write(
 
 
 def _lines(table: Mapping[str, Any]) -> list[str]:
-    """Entries as TOML, whose texts and numbers are those of JSON."""
+    """Format entries as TOML; its texts and numbers are those of JSON."""
     return [f"{name} = {json.dumps(value, ensure_ascii=False)}" for name, value in table.items()]

@@ -1,4 +1,4 @@
-"""What a comparison of scenes has found: its result, as a table and in sentences."""
+"""Results of a comparison of scenes, as a table and in sentences."""
 
 import dataclasses
 import json
@@ -16,7 +16,7 @@ from polar_bayes.priors import describe_prior
 
 
 def is_apart[T: (float, pd.Series)](difference: T, error: T) -> T:
-    """Whether a difference in elpd (nat) tells scenes apart: beyond 2 standard errors, and 4."""
+    """Return whether an elpd difference (nat) is significant: above 2 standard errors, and 4."""
     return (difference > 4.0) & (difference > 2.0 * error)
 
 
@@ -92,7 +92,7 @@ class SceneComparison:
 
 
 def scene_table(result: xr.DataTree | SceneComparison) -> pd.DataFrame:
-    """A row for each scene: predictions, weight, intervals of the material, and criticism.
+    """Return a row for each scene: predictions, weight, intervals and criticism.
 
     Args:
         result: What `polar_bayes.compare_scenes` returned, or a fit with scene="auto".
@@ -119,7 +119,7 @@ def scene_table(result: xr.DataTree | SceneComparison) -> pd.DataFrame:
 
 
 def scene_sentences(result: xr.DataTree | SceneComparison) -> list[str]:
-    """Which scenes were compared, which remain and why, and what the choice does to the intervals.
+    """State which scenes remain and why, and the effect of the choice on intervals.
 
     Args:
         result: What `polar_bayes.compare_scenes` returned, or a fit with scene="auto".
@@ -174,18 +174,18 @@ def scene_sentences(result: xr.DataTree | SceneComparison) -> list[str]:
 
 
 def _why_not(scene: xr.Dataset) -> str:
-    """Why a scene does not remain."""
+    """Explain why a scene does not remain."""
     name, difference = str(scene["scene"].item()), abs(float(scene["elpd_diff"]))
     error = float(scene["dse"])
     if is_apart(difference, error):
         return f"Not {name}: it predicts worse, by {difference:.1f} ± {error:.1f} nat in all."
     if "priors" in str(scene["criticism"].item()):
-        return f"Not {name}: its parameters are where their priors hardly allow them."
+        return f"Not {name}: its parameters are in the tails of their priors."
     return f"Not {name}: it adds nothing to the others ({difference:.1f} ± {error:.1f} nat behind)."
 
 
 def _escaped(found: xr.Dataset, chosen: str) -> Iterator[str]:
-    """Scenes that lie against a bound of the index, which the chosen one may only have escaped."""
+    """Return scenes at a bound of the index, which the chosen scene may merely avoid."""
     if "index_bound" not in found or np.isfinite(found["index_bound"].sel(scene=chosen)):
         return
     bound = found["index_bound"].to_series().dropna()
@@ -199,7 +199,7 @@ def _escaped(found: xr.Dataset, chosen: str) -> Iterator[str]:
 
 
 def _between(found: xr.Dataset) -> list[str]:
-    """What share of the width of each interval is between scenes."""
+    """State the share of the width of each interval that is between scenes."""
     share = found["between_share"].to_series().dropna()
     much = share[share >= 0.1]  # of its variance
     if much.empty:

@@ -1,4 +1,4 @@
-"""Stacked posterior of several scenes: draws of each fit in proportion to its stacking weight.
+"""Stacked posterior of several scenes: draws of each fit in proportion to its weight.
 
 Source:
     Yao, Vehtari, Simpson & Gelman (2018), Bayesian Analysis 13, 917.
@@ -31,7 +31,7 @@ OF_DRAWS = (
     *("posterior", "sample_stats", "log_prior", "log_likelihood"),
     *("posterior_predictive", "noise_free"),
 )
-"""Groups whose draws are those of the posterior."""
+"""Groups that contain posterior draws."""
 
 SHARED = ("prior", "prior_predictive", "observed_data", "constant_data")
 """Groups that are taken from the scene of largest weight."""
@@ -43,7 +43,7 @@ def fit_best_scenes(
     progress: Progress,
     keep: Keep | None = None,
 ) -> xr.DataTree:
-    """Compare scenes, and fit those that remain by a method; their posteriors are stacked."""
+    """Compare scenes, fit those that remain by a method, and stack their posteriors."""
     if isinstance(method, Point):
         raise FitError(
             "a point estimate has no width to compare scenes by",
@@ -91,7 +91,7 @@ def fit_best_scenes(
 
 
 def _add_provenance(result: xr.DataTree, **more: object) -> None:
-    """Replace entries; a comparison with alternatives that was made is not one that failed."""
+    """Replace provenance entries; a comparison that was made removes its failure."""
     provenance = json.loads(result.attrs[PROVENANCE]) | more
     if "alternatives" in more:
         provenance.pop("alternatives_failed", None)
@@ -99,13 +99,13 @@ def _add_provenance(result: xr.DataTree, **more: object) -> None:
 
 
 def _serves_as_chains(weighted: xr.DataTree) -> bool:
-    """Whether weighted draws of a comparison converged, with weights of finite variance."""
+    """Return whether weighted draws converged, with weights of finite variance."""
     pareto_k = provenance_of(weighted).get("pareto_k")
     return pareto_k is not None and pareto_k <= FINITE_VARIANCE and verdict(weighted).converged
 
 
 def stack_fits(fits: Mapping[str, xr.DataTree], weights: Mapping[str, float]) -> xr.DataTree:
-    """One fit whose draws are of several fits, over the parameters that they share."""
+    """Combine draws of several fits over the parameters that they share."""
     trees = {name: fits[name] for name in sorted(weights, key=lambda name: -weights[name])}
     first = next(iter(trees.values()))
     index = _draws_of_each(trees, weights)
@@ -136,7 +136,7 @@ def stack_fits(fits: Mapping[str, xr.DataTree], weights: Mapping[str, float]) ->
 def _draws_of_each(
     trees: Mapping[str, xr.DataTree], weights: Mapping[str, float]
 ) -> dict[str, np.ndarray]:
-    """Evenly spaced draws of each fit, as many as its weight allows where no draw is repeated."""
+    """Select evenly spaced draws of each fit in proportion to its weight, unrepeated."""
     sizes = {name: tree["posterior"].sizes["draw"] for name, tree in trees.items()}
     total = min(sizes[name] / weights[name] for name in trees)
     return {
@@ -146,7 +146,7 @@ def _draws_of_each(
 
 
 def _shared(datasets: list[xr.Dataset]) -> list[str]:
-    """Variables of one shape but for their draws in all datasets."""
+    """Return variables with the same shape, apart from draws, in all datasets."""
 
     def shape(variable: xr.DataArray) -> dict[Hashable, int]:
         return {dim: n for dim, n in variable.sizes.items() if dim not in SAMPLE_DIMS}
@@ -160,7 +160,7 @@ def _shared(datasets: list[xr.Dataset]) -> list[str]:
 
 
 def _shuffled(dataset: xr.Dataset) -> xr.Dataset:
-    """Draws in random order, the same in every group: chains mix the scenes."""
+    """Permute draws equally in every group, so that each chain mixes the scenes."""
     order = np.random.default_rng(0).permutation(dataset.sizes["draw"])
     return dataset.isel(draw=order).assign_coords(draw=np.arange(order.size))
 
@@ -168,7 +168,7 @@ def _shuffled(dataset: xr.Dataset) -> xr.Dataset:
 def _provenance(
     trees: Mapping[str, xr.DataTree], weights: Mapping[str, float], shared: list[str]
 ) -> str:
-    """That of the heaviest scene; problems are those of all."""
+    """Return the provenance of the heaviest scene, with the problems of every stacked scene."""
     each = {name: provenance_of(tree) for name, tree in trees.items()}
     found = dict(next(iter(each.values())))
     for key in ("modes", "pareto_k"):

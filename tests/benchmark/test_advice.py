@@ -86,7 +86,9 @@ def test_where_nothing_is_good_enough_the_nearest_is_named():
 
 def test_a_doubtful_reference_is_told_with_the_advice():
     _, said = pb.benchmark.accuracy_sentences(make_accuracy(doubts="its R-hat is 1.300"))
-    assert said.startswith("Take it with care: of the reference itself, its R-hat is 1.300.")
+    assert said.startswith(
+        "Use this advice with care, since the reference is in doubt: its R-hat is 1.300."
+    )
 
 
 @pytest.mark.thorough

@@ -127,7 +127,7 @@ def test_readings_are_judged_by_themselves() -> None:
     said = pb.verdict(good).sentences
     assert "Readings (dop, intensity; fresh ones and ones left out) pass a joint test" in said[1]
     said = pb.verdict(bad).sentences
-    assert " fail a joint test of their own that a right model fails 5%" in said[1]
+    assert " fail a separate joint test that a right model fails 5%" in said[1]
     assert "dop, fresh: predictions are too narrow (p = 0.0001)." in said
     assert not any(line.startswith("intensity") and "too narrow" in line for line in said)
     assert any(line.startswith("dop, left out: in 40 of 400 fits the weights") for line in said)

@@ -33,7 +33,7 @@ def test_repeats_that_scatter_as_they_say_raise_few_alarms() -> None:
     for _ in range(runs):
         means = {name: 0.3 + SD * random.standard_normal(5) for name in ("roughness", "absorption")}
         table = pb.calibration.retest(fits(means))
-        alarms += table["conclusion"].str.contains("more than the intervals say").any()
+        alarms += table["conclusion"].str.contains("more than the intervals predict").any()
         pairs.append(table["agreeing"].mean())
     assert alarms <= stats.binom.ppf(0.9999, runs, 0.05)
     assert np.mean(pairs) == pytest.approx(0.95, abs=0.02)
@@ -49,7 +49,8 @@ def test_repeats_that_scatter_more_are_told_by_how_much() -> None:
     assert row["agreeing"] < 0.6
     assert row["pairs"] == 66
     assert (
-        row["conclusion"] == f"repeats scatter {row['ratio']:.1f} times more than the intervals say"
+        row["conclusion"]
+        == f"repeats scatter {row['ratio']:.1f} times more than the intervals predict"
     )
 
 

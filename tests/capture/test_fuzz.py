@@ -33,7 +33,7 @@ def sample(count):
 
 
 def outcome(function, *arguments, **options):
-    """What comes out of a door: None after a refusal in one line, anything else is returned."""
+    """Return the result of a reader, or None after a refusal in one line."""
     try:
         return function(*arguments, **options)
     except CaptureError as error:

@@ -41,7 +41,7 @@ BEYOND = {
         2.03,
     ),
 }
-"""What is said of each, the option that allows its index, and that index."""
+"""Message for each, the option that allows its index, and that index."""
 
 LEVELS = {"high_index": "problem", "index_2_03": "caution"}
 

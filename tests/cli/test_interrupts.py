@@ -67,7 +67,7 @@ def is_caught(status: str, number: int) -> bool:
 
 
 def stopped(process: subprocess.Popen, number: int) -> str:
-    """What a process says on stderr after a signal; it ends in time, with the right status."""
+    """Return stderr of a process after a signal; it must end in time, with the right status."""
     assert process.poll() is None, process.communicate()
     begin = time.monotonic()
     process.send_signal(number)

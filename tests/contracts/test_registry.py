@@ -20,7 +20,7 @@ ASKED = {"model": line, "scene": PLATE, "links": LINKS}
 
 
 class Ran(BaseException):
-    """What a verb was about to run; no error that it would handle."""
+    """Records what a verb was about to run; a base exception that no handler catches."""
 
 
 def capture() -> Any:

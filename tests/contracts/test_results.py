@@ -27,7 +27,7 @@ RESULTS = {
     "map": lambda: make_maps({"roughness": np.linspace(0.0, 1.0, 12).reshape(3, 4)}),
 }
 FILES = {"fit": "result.nc", "calibration": "calibration.nc", "accuracy": "accuracy.nc"}
-"""What a report writes beside its page; a map is too large."""
+"""Files that a report writes next to its page; that of a map is too large."""
 
 every_result = each(("name", "make"), RESULTS.items(), ids=RESULTS)
 

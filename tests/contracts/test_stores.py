@@ -40,7 +40,7 @@ def whole(kind: Stored, tmp_path_factory: pytest.TempPathFactory) -> xr.Dataset 
 
 @pytest.fixture(scope="module")
 def writes(kind: Stored, tmp_path_factory: pytest.TempPathFactory) -> int:
-    """How often a run writes to the disk."""
+    """Count how often a run writes to the disk."""
     written: list[int] = []
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(os, "fsync", written.append)
@@ -71,7 +71,9 @@ def test_what_was_broken_off_goes_on_to_the_same_bits(kind, whole, begun, tmp_pa
         said.extend(clean_up())  # as an interrupt does
 
     found = kind.run(store, resume=True, progress=progress)
-    assert said == [f"{store}: what is done is kept; repeat the command with --resume to go on"]
+    assert said == [
+        f"{store}: finished work is saved; repeat the command with --resume to continue"
+    ]
     assert seen[0] > 2 * kind.block  # what is done is not done again
     assert seen[-1] == kind.total
     assert_same_bits(found, whole)
@@ -278,7 +280,7 @@ def opened(file, topics=TOPICS, *, resume=True):
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    """Of three blocks."""
+    """Return the file of one of three blocks."""
     file = tmp_path / "map.zarr.progress"
     with opened(file, resume=False) as journal:
         journal.read()

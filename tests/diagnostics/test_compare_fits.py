@@ -16,7 +16,7 @@ SMALL = {"wavelengths": (), "views": 16, "draws": 150, "variables": ("dop",)}
 
 
 def off(result: xr.DataTree, by: float) -> xr.DataTree:
-    """The same fit with a prediction that is beside the readings."""
+    """Return the same fit with a prediction that misses the readings."""
     density = result["log_likelihood"].to_dataset()["dop"]
     return replace(result, "log_likelihood", "dop", density - by * (density["view"] % 3))
 

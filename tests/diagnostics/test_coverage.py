@@ -134,7 +134,7 @@ def test_maps_that_are_still_to_be_computed_are_computed_once(monkeypatch):
 def test_what_does_not_fit_is_refused() -> None:
     maps = make_maps({"roughness": HALF})
     for given, truth, error, words in (
-        (maps, {"albedo": 0.3}, pb.CaptureError, "leaf: it knows the truth of no parameter"),
+        (maps, {"albedo": 0.3}, pb.CaptureError, "leaf: it states the truth of no parameter"),
         (
             maps,
             {"roughness": SPREAD.T},

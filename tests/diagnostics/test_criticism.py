@@ -318,8 +318,8 @@ def test_a_reading_that_alone_knows_a_parameter_is_named_and_is_no_caution() -> 
     tree = replace(tree, "observed_data", "dop", 0.5 * SCALE["dop"] * rng.standard_normal(6))
     assert criticize(tree).loc["influence", "level"] == "passed"
     remark = sensitivity(tree).loc["roughness", "remark"]
-    assert "rests on dop at 40 degrees" in remark
-    assert "rests on" not in sensitivity(tree).loc["absorption", "remark"]
+    assert "depends on dop at 40 degrees" in remark
+    assert "depends on dop" not in sensitivity(tree).loc["absorption", "remark"]
 
 
 def test_a_reading_within_its_stated_error_is_no_outlier() -> None:

@@ -14,7 +14,7 @@ SMALL = {"wavelengths": (), "views": 20, "draws": 150}
 
 
 def leaves(band) -> bool:
-    """Whether the curve leaves its band anywhere."""
+    """Return whether the curve leaves its band anywhere."""
     outside = (band.difference < band.lower - 1e-9) | (band.difference > band.upper + 1e-9)
     return bool(np.any(outside))
 

@@ -107,7 +107,7 @@ def test_the_reference_has_every_public_name_once(pages: dict[Path, BeautifulSou
 
 @pytest.fixture(scope="module")
 def address(site: Path) -> Iterator[str]:
-    """Where the site is served: a search reads files, which a browser denies to pages on disk."""
+    """Serve the site: its search reads files, which browsers deny to pages on disk."""
     handler = functools.partial(Quiet, directory=site)
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever).start()

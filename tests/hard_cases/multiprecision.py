@@ -134,7 +134,7 @@ class Boundary(NamedTuple):
 
 
 def boundary(sin_squared: mp.mpf, above: mp.mpf, films: list, below: mp.mpf) -> Boundary:
-    """By characteristic matrices; films are (index, 2 pi thickness/wavelength), top down."""
+    """Powers by characteristic matrices; films are (index, 2 pi thickness/wavelength), top down."""
 
     def admittances(n: mp.mpf) -> tuple[mp.mpf, mp.mpf]:
         inside = mp.sqrt(1 - sin_squared / n**2)
@@ -160,7 +160,7 @@ def boundary(sin_squared: mp.mpf, above: mp.mpf, films: list, below: mp.mpf) -> 
 
 
 class Powers(NamedTuple):
-    """What a stack does to power along s, along p, and to the product of their fields."""
+    """Factors of a stack on power along s, along p, and on the product of their fields."""
 
     s: mp.mpf
     p: mp.mpf

@@ -149,7 +149,7 @@ def our_retroreflected(zenith, n):
 
 
 def retroreflected(zenith, n):
-    """The same by the angle of the s axis, atan2(0, 0)."""
+    """Return the same quantity from the angle of the s axis, atan2(0, 0)."""
     x = jnp.sin(jnp.deg2rad(zenith - zenith))
     turn = 2.0 * jnp.arctan2(0.0 * x, x)
     return 0.5 * (jnp.cos(turn) ** 2 + jnp.sin(turn) ** 2) + 0.0 * n

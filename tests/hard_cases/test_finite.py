@@ -161,7 +161,7 @@ def rows(scene: Scene, dtype: type) -> tuple[list[str], np.ndarray]:
 
 
 def readings(scene: Scene, row: Array) -> Array:
-    """All readings of one view, from one row of inputs."""
+    """Return all readings of one view, from one row of inputs."""
     color = jnp.asarray([WAVELENGTH], row.dtype) if scene in EFFECT_SCENES.values() else None
     geometry = Geometry(row[0:1], jnp.zeros_like(row[0:1]), row[1:2], row[2:3], color)
     parameters, start = {}, 3

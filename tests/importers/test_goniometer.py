@@ -26,7 +26,7 @@ def fresnel(angle, index=GLASS):
 
 
 def readings(full=1000.0, dark=0.0, angles=ANGLES):
-    """What a detector prints, to two decimals, for s and p."""
+    """Return detector readings of s and p, to two decimals."""
     return [(angles, np.round(dark + full * light, 2)) for light in fresnel(angles)]
 
 

@@ -21,7 +21,7 @@ FLAT = np.broadcast_to(pictures.unit(np.array([0.3, 0.5, 0.8])), (*pictures.SHAP
 
 
 def mosaic(frames, layout=SONY):
-    """What a sensor reads of four frames, each pixel behind its own polarizer."""
+    """Return the mosaic of four frames, each pixel behind its own polarizer."""
     found = np.zeros(frames[0].shape)
     for row in (0, 1):
         for column in (0, 1):
@@ -177,7 +177,7 @@ LIGHT = {"red": 1.0, "green": 0.7, "blue": 0.4}
 
 
 def color_mosaic(frames, light=LIGHT):
-    """What a color sensor reads: squares of four polarizers behind a Bayer pattern."""
+    """Return the mosaic of a color sensor: squares of four polarizers behind a Bayer pattern."""
     mono, found = mosaic(frames), np.zeros(frames[0].shape)
     for row, column in np.ndindex(4, 4):
         share = light[BAYER[row // 2][column // 2]]

@@ -20,7 +20,7 @@ REASONS = ("outside", "turned_away", "in_shadow", "saturated", "too_dark", "over
 
 
 def predicted(capture):
-    """What the scene says at the capture's own directions."""
+    """Predict readings by the scene at the capture's own directions."""
     names = ("view_zenith", "view_azimuth", "light_zenith", "light_azimuth")
     geometry = pb.Geometry.from_degrees(**{name: capture[name].values for name in names})
     return {name: np.asarray(x) for name, x in SCENE.predict(TRUTH, geometry).items()}

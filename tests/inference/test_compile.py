@@ -72,7 +72,7 @@ def test_the_sampler_is_compiled_beside_the_search_and_once(programs: list[str])
 
 
 class Gate:
-    """Where a thread waits, and another one sees that it does."""
+    """A barrier at which a thread waits, and another one sees that it does."""
 
     def __init__(self) -> None:
         self.reached, self.open = threading.Event(), threading.Event()

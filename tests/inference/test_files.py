@@ -95,7 +95,7 @@ OF_STUDIES = (pb.summary, pb.benchmark.accuracy_sentences, lambda tree: pb.show(
 
 
 def check_mutations(trees, functions, random, count):
-    """How many of the damaged trees are refused at the door."""
+    """Count how many of the damaged trees are refused when they enter."""
     refused = 0
     for _ in range(count):
         with warnings.catch_warnings():

@@ -63,7 +63,7 @@ def compile_fast_rather_than_fast_code(monkeypatch: pytest.MonkeyPatch) -> Itera
 
 @pytest.fixture
 def compiled() -> Iterator[list[str]]:
-    """What JAX compiles or reads from its cache, as it happens."""
+    """Record what JAX compiles or reads from its cache."""
     with compilations() as found:
         yield found
 
@@ -388,7 +388,8 @@ MOST_PROGRAMS = {
     "choose effects": 11,
     "report": 0,
 }
-"""That a verb compiles in a new process, after those above it; of effects, 9 are of its scenes."""
+"""Most programs that a verb compiles in a new process, after the verbs above it; 9 of those of
+effects are for its scenes."""
 
 COUNTING = """
 import json, sys

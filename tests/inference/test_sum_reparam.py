@@ -27,7 +27,7 @@ BASIS = np.cos(np.outer(np.arange(1, 3), np.radians(ZENITH)))  # (coefficient, v
 
 
 def shares(data, scene, priors, links):
-    """What readings lack is the sum of two shares and a smooth error."""
+    """A model whose readings depend on the sum of two shares and a smooth error."""
     leak = numpyro.sample("leak", HalfNormal(LEAK), infer={"summed": True})
     body = numpyro.sample("body", Beta(1.0, POWER), infer={"summed": True})
     w = numpyro.sample("w", dist.Normal(0.0, WIDTH).expand([2]).to_event(1))
@@ -38,7 +38,7 @@ def shares(data, scene, priors, links):
 
 
 def bounded(data, scene, priors, links):
-    """The same where no share has a range without an end."""
+    """The same model with upper bounds on both shares."""
     uniform = dist.Uniform(0.0, 0.5)
     names = ("leak", "body")
     leak, body = (numpyro.sample(name, uniform, infer={"summed": True}) for name in names)

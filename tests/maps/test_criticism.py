@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 METHOD = pb.methods.CorrectedLaplace(sampler=None)
 KNOWN = {**ASKED, "method": METHOD}
 INFERRED = {**KNOWN, "model": "per_material"}
-"""Where the stated errors are taken as they are, and where pixels infer by what factor they err."""
+"""Whether stated errors are used unchanged, or pixels infer a factor on them."""
 
 VIEWS = np.concatenate([np.linspace(20.0, 45.0, 9), np.linspace(64.0, 80.0, 9)])
 ERROR = 0.01
@@ -244,14 +244,14 @@ def test_a_map_counts_what_the_checks_found(known: xr.Dataset) -> None:
     assert sentence in " ".join(str(pb.show(known)).split())
     page = render(known)
     assert sentence in page
-    assert "neighboring views that err alike" in page
+    assert "correlated errors of neighboring views" in page
 
 
 def test_an_older_map_was_not_checked(known: xr.Dataset) -> None:
     older = known.drop_vars("criticism")
     assert pb.maps.count_criticism(older).empty
     assert pb.maps.criticism_sentences(older) == []
-    assert "neighboring views that err alike" not in render(older)
+    assert "correlated errors of neighboring views" not in render(older)
 
 
 def test_a_contradicted_pixel_counts_in_no_region(known: xr.Dataset) -> None:

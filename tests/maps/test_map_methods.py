@@ -32,7 +32,7 @@ def weighted(image: xr.Dataset, compiled_in_haste: None) -> xr.Dataset:
 
 
 class OneByOne(pb.methods.Importance):
-    """The same settings, for one pixel after another."""
+    """A method with the same settings that fits one pixel after another."""
 
     run_batch = AbstractMethod.run_batch
 

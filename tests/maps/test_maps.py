@@ -79,7 +79,7 @@ class Twin:
 
 
 def _guide_covariance(program: Program, z: jax.Array, data) -> jax.Array:
-    """Of the guide, in the order of the program's own vector."""
+    """Return the covariance of the guide, in the order of the program's own vector."""
     guide = AutoLaplaceApproximation(program.model)
     with handlers.seed(rng_seed=0):
         guide(data)

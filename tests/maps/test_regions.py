@@ -59,7 +59,7 @@ def quarters() -> np.ndarray:
 
 
 def of_levels(image: xr.Dataset, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Of the levels: mean and own variance of each region given no zero; variance by the zero."""
+    """Return mean and own variance of each region's levels given no zero; variance by the zero."""
     level = image["q"].mean("view").to_numpy()
     noise = NOISE**2 / image.sizes["view"]
     shrinkage = SPREAD**2 / (SPREAD**2 + noise)

@@ -45,7 +45,7 @@ class Grid(NamedTuple):
         return float(np.sqrt(self.weights @ (self.values[name] - self.mean(name)) ** 2))
 
     def root_sd(self, name: str) -> float:
-        """Of the square root: where a tail is long, draws do not tell the error of their sd."""
+        """Sd of the square root: draws from a long tail determine their own sd poorly."""
         root = np.sqrt(self.values[name])
         return float(np.sqrt(self.weights @ (root - self.weights @ root) ** 2))
 

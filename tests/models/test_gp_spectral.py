@@ -105,7 +105,7 @@ class Twin:
         self.contrast = np.array([[1.0, -1.0, 0.0], [0.0, 1.0, -1.0]])
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Of many points (point, 7): three indices, log odds, and three logarithms."""
+        """Log density at points (point, 7): three indices, log odds, and three logarithms."""
         index = x[:, :3]
         odds, factor, amplitude, length = x[:, 3], *np.exp(np.clip(x[:, 4:].T, -20.0, 20.0))
         fraction = 1.0 / (1.0 + np.exp(-odds))

@@ -88,7 +88,7 @@ def normal(x: np.ndarray, center: np.ndarray | float, spread: np.ndarray | float
 
 
 class Twin:
-    """The same posterior in NumPy and SciPy, in the parameters themselves."""
+    """The posterior in NumPy and SciPy, in the constrained parameters."""
 
     def __init__(self, capture: xr.Dataset) -> None:
         self.q = capture["q"].to_numpy()

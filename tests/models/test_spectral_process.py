@@ -25,7 +25,7 @@ LENGTHS = (1e-2, 1.0, 60.0, 300.0, 1e5)
 
 
 def covariance(process: SpectralProcess, length: float, wavelength: np.ndarray) -> np.ndarray:
-    """Of what the weights do, without drawing."""
+    """Return the covariance of the values by the weights, without drawing."""
     length, wavelength = jnp.asarray(length), jnp.asarray(wavelength)
     knot_wavelengths = process.knot_wavelengths(wavelength)
     weights = jnp.eye(min(wavelength.size, process.knots))

@@ -159,7 +159,7 @@ def test_the_slope_of_the_log_survival_is_minus_the_hazard(dtype):
 
 
 def value_gradient_hessian(function, rows):
-    """All three of a scalar function of each row, the Hessian times a vector without zeros.
+    """Return value, gradient and Hessian times a vector without zeros, row by row.
 
     One entry that is not finite spoils its row, and the product compiles in half the time.
     """

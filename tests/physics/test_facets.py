@@ -24,7 +24,7 @@ MATERIAL = {"roughness": jnp.asarray(ROUGHNESS), "refractive_index": jnp.asarray
 
 
 def polarization(surface: RoughSurface, views: Geometry) -> np.ndarray:
-    """Of light reflected and of light on its way out."""
+    """Polarization of reflected light, and of light on its way out."""
 
     @jax.jit
     def both(material: dict) -> tuple:

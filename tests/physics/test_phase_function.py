@@ -138,7 +138,7 @@ FIGURES = {
     0.8: (0.005, 0.001, 0.012, 0.012),
     0.9: (0.018, 0.001, 0.035, 0.02),
 }
-"""By anisotropy; the last two are those of docs/equations.md."""
+"""Numbers by anisotropy; the last two are those of docs/equations.md."""
 
 
 @pytest.mark.parametrize(
@@ -223,7 +223,7 @@ def turned(way: np.ndarray, g: float, random: np.random.Generator) -> np.ndarray
 
 
 class ManyTurns(HenyeyGreenstein):
-    """The same with a sky of 360 azimuths."""
+    """The same body with a sky of 360 azimuths."""
 
     turns = tuple((float(turn), 1.0 / 360.0) for turn in range(360))
 

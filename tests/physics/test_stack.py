@@ -25,7 +25,7 @@ escape = jax.jit(Stack.escape)
 
 
 def thick(indexes: list[float], absorbances: list[float | None]) -> Stack:
-    """From air to body; None leaves the absorbance out."""
+    """Powers from air to body; None leaves the absorbance out."""
     layers = tuple(
         Layer(jnp.asarray(n), None if a is None else jnp.asarray(a))
         for n, a in zip(indexes[1:-1], absorbances, strict=True)

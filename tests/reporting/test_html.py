@@ -77,7 +77,7 @@ def test_it_says_whether_intervals_can_be_trusted(small) -> None:
     # A parameter in the tail of its prior, far enough for a caution.
     doubted = edit_provenance(small[0].copy(), prior_probability={"roughness": [0.997]})
     text = Page(render(doubted)).text
-    assert "Trust the intervals with care: the cautions say what" in text
+    assert "Use the intervals with care: see the cautions" in text
     assert "The fit converged. Mind the cautions." in text
 
 
@@ -94,7 +94,7 @@ def test_one_rule_judges_pit_values(monkeypatch: pytest.MonkeyPatch, small) -> N
             assert ("Nothing speaks against the intervals" in shown) == is_passed
             assert ("PIT values of dop are not uniform" in shown) != is_passed
             assert ("do not use these intervals" in shown) == (level == "problem")
-        assert ("Trust the intervals with care" in text) == (level == "caution")
+        assert ("Use the intervals with care" in text) == (level == "caution")
 
 
 def test_what_is_said_to_be_checked_was_checked(small) -> None:

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("unpainted")
 
 
 def text_of(page: str) -> str:
-    """What a reader sees, and nothing of the style."""
+    """Return the visible text of a page, without its style."""
     body = re.sub(r"<[^>]*>", " ", page.partition("<body>")[2])
     return html.unescape(" ".join(body.split()))
 

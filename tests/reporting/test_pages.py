@@ -90,7 +90,7 @@ def odd() -> xr.DataTree:
 
 
 def mixed(**asked: object) -> xr.Dataset:
-    """Of 200 pixels 160 are good: 100 by weights, 50 by a fitted proposal, 10 by NUTS."""
+    """A map with 160 good pixels of 200: 100 by weights, 50 by a fitted proposal, 10 by NUTS."""
     status, method = np.full(200, Status.GOOD), np.full(200, MethodUsed.IMPORTANCE)
     method[100:150], method[150:160] = MethodUsed.ADAPTED, MethodUsed.NUTS
     status[160:195], method[160:195] = Status.MASKED, MethodUsed.NONE
@@ -107,7 +107,7 @@ def truth(name: str = "leaf") -> xr.Dataset:
 
 
 def map_in_colors() -> xr.Dataset:
-    """Of five parameters and four wavelengths, not all of which are drawn."""
+    """A map of five parameters and four wavelengths, not all of which are drawn."""
     names = ("refractive_index", "roughness", "subsurface_fraction", "angle_zero", "dark_level")
     means = {name: np.full((3, 4), 0.5) for name in names}
     means["refractive_index"] = np.full((3, 4, 4), 1.5)
@@ -250,7 +250,7 @@ ASKED_OF_A_REPORT: dict[str, Callable[[], tuple]] = {
     "it is of another image": lambda: (
         mixed(), {"truth": truth(), "uncorrected": mixed().isel(y=slice(3))}
     ),
-    "it knows the truth of no parameter": lambda: (mixed(), {"truth": xr.Dataset()}),
+    "it states the truth of no parameter": lambda: (mixed(), {"truth": xr.Dataset()}),
 }  # fmt: skip
 """Results and arguments that do not go together, by what is said of them."""
 

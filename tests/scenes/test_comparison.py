@@ -176,7 +176,7 @@ def test_what_is_no_scene_is_refused(capture: xr.Dataset) -> None:
 
 
 def without_fits(monkeypatch: pytest.MonkeyPatch, gains: dict[str, float]) -> None:
-    """In place of every fit, a gain for each part of its scene; the scenes in place of tables."""
+    """Replace every fit by a gain for each part of its scene, and tables by the scenes."""
 
     def stand_in(name: str, requests: list, *_: Any) -> SimpleNamespace:
         total = sum(gain for part, gain in gains.items() if part in name)

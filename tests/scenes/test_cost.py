@@ -139,7 +139,7 @@ def by_hand(parameters, geometry):
 
 
 def operations(predict, names) -> float:
-    """Of values and derivatives of all readings by all parameters."""
+    """Count operations of values and derivatives of all readings by all parameters."""
     parameters = {name: jnp.asarray(NEUTRAL[name]) for name in names}
 
     def weighed(parameters, weights):

@@ -98,7 +98,7 @@ def test_two_that_are_light_alone_and_heavy_together_do_not_both_go(q: np.ndarra
     assert kept.sel(effect=heavier)
     assert kept.sel(effect=["AngleZero", "DarkLevel"]).sum() == 1
     said = choice.ledger["reason"].sel(effect=heavier).item()
-    assert said.startswith("with all others that could go, ")
+    assert said.startswith("without all other effects that may be dropped, ")
     assert choice.ledger.attrs["combined_change"] == pytest.approx(min(first, second), rel=1e-3)
 
 
@@ -135,14 +135,20 @@ def test_the_rule_asks_what_the_rest_changes_beside_what_the_user_drops(q: np.nd
 def test_a_parameter_that_the_user_names_is_not_given_up(q: np.ndarray) -> None:
     choice = straight(q, parameters=["dark_level"], tolerance=1e6)
     assert choice.ledger["kept"].to_numpy().tolist() == [False, True, False]
-    assert "it leaves nothing to judge" in choice.ledger["reason"].sel(effect="DarkLevel").item()
+    assert (
+        "no judged parameter is left without it"
+        in choice.ledger["reason"].sel(effect="DarkLevel").item()
+    )
 
 
 @each(
     ("options", "message"),
     [
         ({"keep": "Fog"}, "keep='Fog': the scene has no such effect; give one of AngleZero"),
-        ({"keep": "DarkLevel", "drop": "DarkLevel"}, "DarkLevel: it is both to keep and to drop"),
+        (
+            {"keep": "DarkLevel", "drop": "DarkLevel"},
+            "DarkLevel: the effect is in both keep and drop",
+        ),
         ({"tolerance": 0.0}, "choose_effects: tolerance is 0.0; give posterior"),
         ({"scene": "camer"}, "scene='camer': no such scene"),
         ({"parameters": ["fog"]}, "parameters: 'fog': the scene with everything on has no such"),

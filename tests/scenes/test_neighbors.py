@@ -101,7 +101,7 @@ def test_a_point_fit_has_nothing_to_compare() -> None:
 
 
 def _fit(preset: str, setup: str, seed: int = 0, parameters=None, **parts) -> xr.DataTree:
-    """A fit by a set-up of forty readings of a world with other parts or known parameters."""
+    """Fit a set-up to forty readings simulated with other parts or known parameters."""
     own = pb.setups.SETUPS[setup]
     if "distribution" in parts:
         parts = {"surface": dataclasses.replace(own.scene.surface, **parts)}
