@@ -9,32 +9,32 @@ from cases import each
 ROOT = Path(__file__).parents[1]
 
 CODE = {
-    "benchmark": 587,
-    "calibration": 1075,
-    "capture": 801,
-    "cli": 1236,
-    "design": 1072,
-    "diagnostics": 1817,
-    "importers": 2106,
-    "inference": 2814,
-    "maps": 1735,
-    "methods": 1252,
-    "numerics": 884,
-    "observation": 505,
-    "physics": 2642,
-    "reporting": 3055,
-    "scenes": 1794,
-    "own files": 1571,
+    "benchmark": 574,
+    "calibration": 1037,
+    "capture": 805,
+    "cli": 1221,
+    "design": 1069,
+    "diagnostics": 1777,
+    "importers": 2091,
+    "inference": 2691,
+    "maps": 1704,
+    "methods": 1226,
+    "numerics": 979,
+    "observation": 499,
+    "physics": 2650,
+    "reporting": 3299,
+    "scenes": 1756,
+    "own files": 1563,
     "models": 320,
-    "tests": 23350,
+    "tests": 23650,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25266,
-    "classes": 353,
-    "constants": 449,
-    "Any": 174,
+    "code": 25261,
+    "classes": 335,
+    "constants": 413,
+    "Any": 191,
     "longest function": 80,
 }
 """Limits of the whole package; the limit of `longest function` is in lines."""

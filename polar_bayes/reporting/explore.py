@@ -321,17 +321,18 @@ def _fitted(
 ) -> dict[str, xr.DataArray]:
     """The readings that the model predicts at the posterior means, in the unit of the capture."""
     shared = shared_parameters(maps)["q50"]
-    engine, pixels = plan.engine, plan.pixels(some)
+    batch = plan.batch(some)
+    engine = batch.engine
     latent = {}
     for name in engine.program.supports:
         axes = engine.parameter_axes[name][0]
         known = maps[name].transpose(*IMAGE, *axes) if name in maps else shared[name]
         values = np.broadcast_to(known, [maps.sizes[dim] for dim in (*IMAGE, *axes)])
-        latent[name] = values.reshape(len(pixels), *values.shape[2:]).astype(np.float32)
-    found = engine.run(_predictor, tuple(names), pixels, latent, single=True)
-    dims = plan.engine.layout.dims
+        latent[name] = values.reshape(len(batch), *values.shape[2:]).astype(np.float32)
+    found = batch.run(_predictor, tuple(names), latent, single=True)
+    dims = engine.layout.dims
     shape = [*(some.sizes[dim] for dim in IMAGE), *(length for _, length in dims)]
-    units = dict.fromkeys(names, 1.0) | {"intensity": float(pixels.static.intensity_unit)}
+    units = dict.fromkeys(names, 1.0) | {"intensity": float(batch.pixels.static.intensity_unit)}
     order = [*IMAGE, *(name for name, _ in dims)]
     return {n: xr.DataArray(np.reshape(x, shape) * units[n], dims=order) for n, x in found.items()}
 
