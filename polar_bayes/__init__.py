@@ -6,6 +6,8 @@ of its layer: `physics`, `instrument`, `links`, `methods`, `models`, `importers`
 `import polar_bayes` starts no array library, and reading a capture does not load a sampler.
 """
 
+import importlib
+
 from polar_bayes.namespace import attach, force_numpyro_import
 
 load_name, __dir__, __all__ = attach(__name__, __file__)
@@ -14,9 +16,8 @@ load_name, __dir__, __all__ = attach(__name__, __file__)
 def __getattr__(name: str) -> object:
     if name != "__version__":
         return load_name(name)
-    from importlib.metadata import version  # as slow as all of this module
-
-    return version("polar_bayes")
+    metadata = importlib.import_module("importlib.metadata")  # as slow as all of this module
+    return metadata.version("polar_bayes")
 
 
 force_numpyro_import()

@@ -60,6 +60,10 @@ class Page(HTMLParser):
         return [value for _, attribute, value in self.attributes if attribute == name]
 
 
+BESIDE_OR_WITHIN = ("#", "data:text/csv;", "explore.html")
+"""What a page may link to: places in it, tables in it, and the map to point at."""
+
+
 def faults_of(page: Page) -> list[str]:
     """List faults of a page: other files, scripts, dead anchors, pictures without words."""
     ids, boxes = page.values("id"), [x for x in page.values("class") if x.startswith("scroll")]
@@ -71,7 +75,7 @@ def faults_of(page: Page) -> list[str]:
         "handlers": [name for _, name, _ in page.attributes if name.startswith("on")],
         "attributes": page.values("srcset") + page.values("action") + page.values("style"),
         "sources": [x for x in page.values("src") if not x.startswith("data:image/svg+xml;base64")],
-        "links": [x for x in page.values("href") if not x.startswith(("#", "data:text/csv;"))],
+        "links": [x for x in page.values("href") if not x.startswith(BESIDE_OR_WITHIN)],
         "names given twice": [name for name in set(ids) if ids.count(name) > 1],
         "dead anchors": led_to - set(ids),
         "pictures without words": [

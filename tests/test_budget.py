@@ -24,14 +24,14 @@ CODE = {
     "physics": 2650,
     "reporting": 3299,
     "scenes": 1756,
-    "own files": 1563,
+    "own files": 1564,
     "models": 320,
-    "tests": 23650,
+    "tests": 23652,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25261,
+    "code": 25262,
     "classes": 335,
     "constants": 413,
     "Any": 191,

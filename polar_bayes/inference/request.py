@@ -210,7 +210,7 @@ def _setup_around(scene: object, capture: xr.Dataset) -> Setup:
             where="scene",
             hint=f"give a polar_bayes.Scene, a Setup, or one of {', '.join(SETUPS)}",
         )
-    base = SETUPS.get(str(capture.attrs.get("setup")), SETUPS["polarimeter"])
+    base = SETUPS.get(str(capture.attrs.get("setup")), SETUPS["paper"])
     return dataclasses.replace(base, scene=scene)
 
 

@@ -102,7 +102,7 @@ def test_it_is_kept_in_a_file_and_the_verdict_names_what_to_know_better(fit, tmp
     (sentence,) = budget_sentences(loaded)
     assert sentence in pb.verdict(loaded).findings
     assert sentence.startswith(
-        "The uncertainty of the set-up makes standard uncertainties larger than"
+        "What the set-up is known to makes standard uncertainties larger than"
     )
     what, sd = better_known(view_of(fit), "refractive_index")
     assert what == "exponent of the sensor's tone curve known to 0.01 instead of 0.02"
@@ -168,7 +168,7 @@ def test_what_cannot_be_known_is_refused(fit, capture, known: dict, message: str
 
 def test_a_set_up_that_states_nothing_has_no_budget(capture, perfect) -> None:
     assert budget_sentences(perfect) == ()
-    with pytest.raises(pb.FitError, match="does not say what its set-up is known to; fit with a"):
+    with pytest.raises(pb.FitError, match="it has no input quantities of its set-up; fit with a"):
         pb.budget(perfect)
     with pytest.raises(pb.FitError, match="no input quantity of this scene; a scene's terms state"):
         pb.fit(capture, known={"sample_lean": 0.1}, **PERFECT)

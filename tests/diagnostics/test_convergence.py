@@ -320,7 +320,7 @@ def test_a_laplace_fit_says_how_far_it_is_off_from_its_own_weighted_draws() -> N
     z = (draws - draws.mean()) / draws.std()
     log_weight = stats.norm.logpdf(z, 0.5, 1.2) - stats.norm.logpdf(z)
     judged = verdict(replace(tree, "sample_stats", "log_weight", log_weight))
-    (told,) = [text for text in judged.cautions if text.startswith("By its own weighted draws")]
+    (told,) = [text for text in judged.cautions if text.startswith("Importance weights correct")]
     shift, change = re.search(r"roughness \(mean by (.*?) sd, sd (.*?)%\)", told).groups()
     assert 0.3 < float(shift) < 0.5
     assert -25.0 < float(change) < -8.0
