@@ -20,7 +20,7 @@ from polar_bayes.inference.program import Model, Program, compile_program, from_
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import dims_of, shape_of
 from polar_bayes.numerics.compile import TRACING_LOCK, JitOnce, LRUCache
-from polar_bayes.numerics.fingerprint import fingerprint
+from polar_bayes.numerics.fingerprint import fingerprint, uses_own_code
 from polar_bayes.observation.data import Observations
 
 MOMENTS = 4000
@@ -71,7 +71,8 @@ class CompiledModel:
 
         def made() -> P:
             found = make(self, settings)
-            if isinstance(found, JitOnce) and self.program.key:
+            is_own = uses_own_code(make, settings)
+            if isinstance(found, JitOnce) and self.program.key and not is_own:
                 found.key = f"{self.program.key} {fingerprint(make, settings, code=())}"
             return found
 

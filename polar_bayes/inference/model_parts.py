@@ -38,11 +38,12 @@ class ModelParts:
     def key(self, *further: object) -> str:
         """A text that is equal for parts whose compiled programs are the same."""
         stated = {name: _stated(prior) for name, prior in self.priors.items()}
-        scene = dataclasses.replace(self.scene)  # without its ledger
-        return fingerprint(self.model, scene, stated, self.links, *further, code=self._code)
+        model, scene, links, *_ = code = self._code
+        return fingerprint(model, scene, stated, links, *further, code=code)
 
     @property
     def _code(self) -> tuple[object, ...]:
+        """Return what may be the user's own; the scene is without its ledger."""
         scene = dataclasses.replace(self.scene)
         return self.model, scene, self.links, *map(type, self.priors.values())
 

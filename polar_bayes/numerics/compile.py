@@ -133,16 +133,19 @@ class JitOnce:
             key = self._key(arguments)
             if key not in self._compilations:
                 kept = kept_program(self.key, arguments)
-                is_kept = kept is not None and kept.exists
-                lowered = None if is_kept else self._function.lower(*arguments)
-                lower = functools.partial(self._lower, arguments, jax.config.jax_enable_x64)
-                self._compilations[key] = _Compilation(lowered, lower, kept)
+                if kept is None or not kept.exists:
+                    compile_now = self._function.lower(*arguments).compile
+                else:
+                    double = jax.config.jax_enable_x64
+                    compile_now = functools.partial(self._trace_and_compile, arguments, double)
+                self._compilations[key] = _Compilation(compile_now, kept)
             return self._compilations[key]
 
-    def _lower(self, arguments: tuple, double: bool) -> Any:
-        """The lowered program, for a thread that asks later."""
+    def _trace_and_compile(self, arguments: tuple, double: bool) -> Any:
+        """Make the program in a thread that finds the kept one damaged."""
         with TRACING_LOCK, jax.enable_x64(double):
-            return self._function.lower(*arguments)
+            lowered = self._function.lower(*arguments)
+        return lowered.compile()
 
     @staticmethod
     def _key(arguments: tuple) -> Hashable:
@@ -151,11 +154,10 @@ class JitOnce:
 
 
 class _Compilation:
-    """A program that is lowered or kept on the disk, made once, by the first thread that asks."""
+    """A program that is kept on the disk or lowered, made once, by the first thread that asks."""
 
-    def __init__(self, lowered: Any, lower: Callable[[], Any], kept: KeptProgram | None) -> None:
-        self._lowered = lowered
-        self._lower = lower
+    def __init__(self, compile_now: Callable[[], Any], kept: KeptProgram | None) -> None:
+        self._compile_now: Callable[[], Any] | None = compile_now
         self._kept = kept
         self._compiled: Any = None
         self._program: Callable | None = None
@@ -166,21 +168,21 @@ class _Compilation:
         # fits: what is still in the queue is compiled by the thread that needs it.
         if self._program is None:
             with self._lock:
-                if self._compiled is None:
-                    self._compiled = self._make()
+                if self._compile_now is not None:
+                    self._compiled = self._make(self._compile_now)
+                    self._compile_now = None  # it may hold readings
                 check_memory(bytes_of(self._compiled))
                 self._program = self._compiled
         return self._program
 
-    def _make(self) -> Any:
-        found = None if self._kept is None or self._lowered is not None else self._kept.load()
-        if found is None:
-            lowered, hits = self._lowered or self._lower(), cache_hits()
-            found = lowered.compile()
-            # XLA cannot write a program again that JAX's own cache has read.
-            if self._kept is not None and cache_hits() == hits:
-                _COMPILER_THREAD.submit(self._kept.save, found)
-        self._lowered = None
+    def _make(self, compile_now: Callable[[], Any]) -> Any:
+        if self._kept is not None and (found := self._kept.load()) is not None:
+            return found
+        hits = cache_hits()
+        found = compile_now()
+        # XLA cannot write a program again that JAX's own cache has read.
+        if self._kept is not None and cache_hits() == hits:
+            _COMPILER_THREAD.submit(self._kept.save, found)
         return found
 
 

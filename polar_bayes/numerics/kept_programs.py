@@ -24,7 +24,7 @@ import jax
 from jax.experimental import serialize_executable
 
 from polar_bayes.namespace import IMPORTED
-from polar_bayes.paths import compiled_folder
+from polar_bayes.paths import atomic_write, compiled_folder
 
 LIBRARIES = ("jax", "jaxlib", "numpyro", "equinox", "tinygp", "numpy")
 
@@ -81,9 +81,8 @@ class KeptProgram:
             if pickle.loads(written)[1] != result:
                 return
             _make_room(self._path.parent)
-            part = self._path.with_suffix(f".{os.getpid()}")
-            part.write_bytes(written)
-            part.replace(self._path)
+            with atomic_write(self._path, replaces=lambda _: True) as unfinished:
+                unfinished.write_bytes(written)
 
 
 def kept_program(key: str, arguments: tuple) -> KeptProgram | None:
@@ -112,7 +111,7 @@ def _digest(texts: Iterable[str]) -> str:
 
 @functools.cache
 def _environment() -> str:
-    """What all programs of a process depend on, as one word; none where sources have changed."""
+    """Digest what all programs of a process depend on; empty where sources have changed."""
     packages = filter(None, map(find_spec, ("polar_bayes", "polar_bayes.models")))
     roots = {
         Path(root) for package in packages for root in package.submodule_search_locations or ()
@@ -140,7 +139,7 @@ def _environment() -> str:
 
 
 def _make_room(folder: Path) -> None:
-    """Make the folder of an environment, and remove those that were used before the last ones."""
+    """Make the folder of an environment, and remove those that were made before the last ones."""
     if folder.is_dir():
         return
     folder.mkdir(parents=True, exist_ok=True)

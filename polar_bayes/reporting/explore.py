@@ -27,6 +27,7 @@ from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.errors import CaptureError, FitError, SceneError, one_line
 from polar_bayes.inference.batching import IMAGE, batched
 from polar_bayes.inference.compiled_model import CompiledModel
+from polar_bayes.inference.program import noise_free
 from polar_bayes.maps.fit_map import MapPlan, mask_missing, plan_map
 from polar_bayes.maps.lazy import checked_status, ensure_loaded, shared_parameters
 from polar_bayes.numerics.compile import JitOnce
@@ -347,8 +348,7 @@ def _predictor(engine: CompiledModel, names: tuple[str, ...]) -> JitOnce:
         shaped = {name: x.reshape(sites[name].shape) for name, x in latent.items()}
         fixed = handlers.substitute(program.model, data=shaped)
         trace = handlers.trace(handlers.seed(fixed, 0)).get_trace(data)
-        means = {name: trace[f"{name}_mean"]["value"] for name in names}
-        return {name: jnp.broadcast_to(x, data.valid.shape) for name, x in means.items()}
+        return {name: jnp.broadcast_to(noise_free(trace, name), data.valid.shape) for name in names}
 
     return batched(predict)
 

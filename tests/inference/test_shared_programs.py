@@ -27,12 +27,14 @@ from spectral_plates import spectral_plate
 import polar_bayes as pb
 from polar_bayes.inference import program as programs
 from polar_bayes.inference import request
+from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.model_parts import ModelParts
 from polar_bayes.inference.problem import compile_model
 from polar_bayes.inference.program import ModelInfo, inspect_model
 from polar_bayes.inference.request import resolve
+from polar_bayes.maps.residuals import fitted_readings
 from polar_bayes.models.per_material import per_material
-from polar_bayes.numerics.compile import LRUCache
+from polar_bayes.numerics.compile import JitOnce, LRUCache
 from polar_bayes.numerics.optimize import ignore_line_search_warnings
 from polar_bayes.observation.data import observe
 from polar_bayes.scenes.effects import ChosenScene
@@ -118,6 +120,18 @@ def test_what_was_compiled_for_others_gives_the_same_draws(method) -> None:
     xr.testing.assert_equal(before["posterior"].to_dataset(), again["posterior"].to_dataset())
     name = "posterior_predictive"
     xr.testing.assert_equal(before[name].to_dataset(), again[name].to_dataset())
+
+
+def test_only_programs_of_the_package_have_a_key_for_other_processes() -> None:
+    """A function of the user's own keeps its name when it is edited."""
+
+    def own(model: CompiledModel, _: None) -> JitOnce:
+        return JitOnce(lambda z: 2.0 * z)
+
+    model = compiled_model(one(1))
+    assert model.program.value_and_gradient.key == f"{model.program.key} value_and_gradient"
+    assert model.program.key in model.made(fitted_readings, model.program.observed).key
+    assert model.made(own, None).key == ""
 
 
 @pytest.mark.thorough
