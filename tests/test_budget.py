@@ -16,25 +16,25 @@ CODE = {
     "design": 1069,
     "diagnostics": 1777,
     "importers": 2091,
-    "inference": 2691,
+    "inference": 2692,
     "maps": 1704,
     "methods": 1226,
-    "numerics": 979,
+    "numerics": 987,
     "observation": 499,
     "physics": 2650,
-    "reporting": 3299,
+    "reporting": 3298,
     "scenes": 1756,
     "own files": 1564,
     "models": 320,
-    "tests": 23652,
+    "tests": 23669,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25262,
+    "code": 25270,
     "classes": 335,
     "constants": 413,
-    "Any": 191,
+    "Any": 192,
     "longest function": 80,
 }
 """Limits of the whole package; the limit of `longest function` is in lines."""

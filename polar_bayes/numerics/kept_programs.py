@@ -14,6 +14,7 @@ import pickle
 import platform
 import shutil
 import threading
+import warnings
 from collections.abc import Callable, Iterable
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -69,7 +70,14 @@ class KeptProgram:
         try:
             program, result = pickle.loads(self._path.read_bytes())
             return serialize_executable.deserialize_and_load(program, self._arguments, result)
-        except Exception:  # whatever is wrong with it, it can be compiled
+        except FileNotFoundError:
+            return None
+        except Exception as error:  # whatever is wrong with it, it can be compiled
+            # In the words of JAX, which the command line counts as one.
+            what = "Error reading persistent compilation cache entry"
+            warnings.warn(
+                f"{what} {self._path.name}: {type(error).__name__}: {error}", stacklevel=2
+            )
             self._path.unlink(missing_ok=True)
             return None
 
@@ -87,16 +95,17 @@ class KeptProgram:
 
 def kept_program(key: str, arguments: tuple) -> KeptProgram | None:
     """The place of a program; None where it has no key, or programs are not kept here."""
-    folder = compiled_folder()
-    if not key or jax.config.jax_compilation_cache_dir != str(folder):
+    folder, config = compiled_folder(), jax.config
+    is_ours = config.jax_compilation_cache_dir == str(folder)
+    if not (key and is_ours and config.jax_enable_compilation_cache):
         return None
-    if jax.device_count() > 1 or jax.default_backend() != "cpu" or jax.config.jax_default_device:
+    if jax.device_count() > 1 or jax.default_backend() != "cpu" or config.jax_default_device:
         return None  # a program runs where it was compiled
     environment = _environment()
     if not environment:
         return None
     leaves, tree = jax.tree.flatten(arguments)
-    words = [key, str(tree), *map(_described, leaves), str(jax.config.jax_enable_x64)]
+    words = [key, str(tree), *map(_described, leaves), str(config.jax_enable_x64)]
     return KeptProgram(folder / "programs" / environment / _digest(words), arguments)
 
 

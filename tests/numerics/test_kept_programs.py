@@ -22,14 +22,19 @@ print(len(compiled), repr(float(pb.summary(result).loc["refractive_index", "mean
 """
 
 
+def run(cache: Path, leakage: float = 0.01, **variables: str) -> subprocess.CompletedProcess[str]:
+    """A fit in a new process."""
+    clean = {name: x for name, x in os.environ.items() if not name.startswith("JAX_")}
+    own = {"XDG_CACHE_HOME": str(cache), "PYTHONPATH": str(Path(__file__).parents[1])}
+    words = [sys.executable, "-c", FIT, str(leakage)]
+    return subprocess.run(
+        words, env=clean | own | variables, capture_output=True, text=True, check=True
+    )
+
+
 def fitted(cache: Path, leakage: float = 0.01) -> tuple[int, float]:
     """How many programs a new process traces and compiles for a fit, and the answer."""
-    clean = {name: x for name, x in os.environ.items() if not name.startswith("JAX_")}
-    tests = str(Path(__file__).parents[1])
-    environment = clean | {"XDG_CACHE_HOME": str(cache), "PYTHONPATH": tests}
-    words = [sys.executable, "-c", FIT, str(leakage)]
-    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=True)
-    count, answer = done.stdout.split()
+    count, answer = run(cache, leakage).stdout.split()
     return int(count), float(answer)
 
 
@@ -68,4 +73,15 @@ def test_another_prior_is_another_program(cache, first) -> None:
 def test_what_is_damaged_is_compiled_again(cache, first) -> None:
     for path in programs(cache):
         path.write_bytes(path.read_bytes()[:100])
-    assert fitted(cache)[1] == first[1]
+    done = run(cache)
+    assert float(done.stdout.split()[1]) == first[1]
+    assert "Error reading persistent compilation cache entry" in done.stderr
+
+
+@pytest.mark.thorough
+def test_nothing_is_kept_where_the_user_says_so(tmp_path: Path, first) -> None:
+    """Also where a folder is named, as the command line does."""
+    folder = str(tmp_path / "polar_bayes" / "compiled")
+    asked = {"JAX_ENABLE_COMPILATION_CACHE": "false", "JAX_COMPILATION_CACHE_DIR": folder}
+    assert float(run(tmp_path, **asked).stdout.split()[1]) == first[1]
+    assert programs(tmp_path) == []
