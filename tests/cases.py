@@ -62,13 +62,17 @@ def _fresh(fixtures: dict[str, Any], number: int) -> Iterator[dict[str, Any]]:
         yield fixtures
 
 
-def each(names: str | Sequence[str], values: Iterable, ids: Names = None) -> Callable:
+def each(
+    names: str | Sequence[str], values: Iterable, ids: Names = None, quick: int | None = None
+) -> Callable:
     """Decorator that runs a test once for each case, as subtests.
 
     Args:
         names: Arguments that the cases fill.
         values: A value for each case; a tuple of them if there is more than one name.
         ids: Names of the cases, or a function of one value.
+        quick: How many of the first cases are enough where time counts. A second test, which is
+            thorough, runs the others. By default all of them.
 
     Decorators above one another give every combination. In each case `monkeypatch` and
     `tmp_path` are fresh; datasets, trees and dictionaries of datasets are copies.
@@ -76,27 +80,40 @@ def each(names: str | Sequence[str], values: Iterable, ids: Names = None) -> Cal
     outer = _cases(names, values, ids)
 
     def decorate(test: Callable) -> Callable:
-        inner, function = getattr(test, "cases", [("", {})]), getattr(test, "one_case", test)
+        inner, function = getattr(test, "cases", [("", {}, True)]), getattr(test, "one_case", test)
         cases = [
-            (" / ".join(filter(None, (inner_name, name))), inner_arguments | arguments)
-            for inner_name, inner_arguments in inner
-            for name, arguments in outer
+            (
+                " / ".join(filter(None, (inner_name, name))),
+                inner_arguments | arguments,
+                is_quick and (quick is None or number < quick),
+            )
+            for inner_name, inner_arguments, is_quick in inner
+            for number, (name, arguments) in enumerate(outer)
         ]
+        has_more = not all(is_quick for _, _, is_quick in cases)
 
         @functools.wraps(function, updated=())  # pytest's hypothesis plugin looks for attributes
-        def every_case(subtests: pytest.Subtests, **fixtures: Any) -> None:
-            for number, (name, arguments) in enumerate(cases):
-                with subtests.test(name), _fresh(fixtures, number) as case_fixtures:
-                    function(**case_fixtures, **arguments)
+        def every_case(subtests: pytest.Subtests, part: str = FIRST, **fixtures: Any) -> None:
+            for number, (name, arguments, is_quick) in enumerate(cases):
+                if is_quick == (part == FIRST):
+                    with subtests.test(name), _fresh(fixtures, number) as case_fixtures:
+                        function(**case_fixtures, **arguments)
 
-        filled = {name for _, arguments in cases for name in arguments}
+        filled = {name for _, arguments, _ in cases for name in arguments}
         parameters = inspect.signature(function).parameters
         requested = [name for name in parameters if name not in filled]
+        requested += ["subtests", *(["part"] if has_more else [])]
         every_case.__signature__ = inspect.Signature(
-            [inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY) for n in [*requested, "subtests"]]
+            [inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY) for n in requested]
         )
         every_case.cases, every_case.one_case = cases, function
-        every_case.pytestmark = getattr(test, "pytestmark", [])
-        return every_case
+        every_case.pytestmark = [m for m in getattr(test, "pytestmark", []) if m != PARTS.mark]
+        return PARTS(every_case) if has_more else every_case
 
     return decorate
+
+
+FIRST = "the first cases"
+PARTS = pytest.mark.parametrize(
+    "part", [FIRST, pytest.param("the other cases", marks=pytest.mark.thorough)]
+)

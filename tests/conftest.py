@@ -1,7 +1,6 @@
 """Shared by every test: double precision, quick compilation, and where measured data may be.
 
-What a test computes once need not be fast: XLA optimizes nothing but what the package itself asks
-it to (`polar_bayes.numerics.compile.compiled`), which takes a third of the time.
+What a test computes once need not be fast: XLA optimizes nothing, which takes a third of the time.
 """
 
 import functools

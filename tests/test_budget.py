@@ -1,6 +1,7 @@
 """The size of the house: who raises a number changes it here, and says what paid for it."""
 
 import ast
+import functools
 from collections import Counter
 from pathlib import Path
 
@@ -26,7 +27,7 @@ CODE = {
     "scenes": 1756,
     "own files": 1564,
     "models": 320,
-    "tests": 23669,
+    "tests": 23712,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
@@ -44,6 +45,7 @@ def lines_of(nodes: list[ast.AST]) -> set[int]:
     return {line for node in nodes for line in range(node.lineno, node.end_lineno + 1)}
 
 
+@functools.cache
 def count(path: Path) -> Counter[str]:
     """Count what one file contains."""
     text = path.read_text()

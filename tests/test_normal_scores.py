@@ -104,7 +104,7 @@ def test_log_odds_are_those_of_a_normal_score() -> None:
     assert np.allclose(score_of_log_odds(log_odds(far)), far, rtol=1e-14)
 
 
-@each("prior", [HalfNormal(SCALE), Beta(1.0, 3.0), Beta(10.0, 1.0), Beta(1.0, 1.0)])
+@each("prior", [HalfNormal(SCALE), Beta(1.0, 3.0), Beta(10.0, 1.0), Beta(1.0, 1.0)], quick=2)
 def test_scores_of_draws_are_standard_normal(prior: dist.Distribution) -> None:
     """Mean, variance and every tenth of 20,000, within 4 standard errors."""
     inverse = biject_to(prior.support).inv
@@ -135,7 +135,7 @@ def normal_in_digits(z: float) -> float:
         return float(share + mpmath.log(slope))
 
 
-@each("dtype", [np.float64, np.float32])
+@each("dtype", [np.float64, np.float32], quick=1)
 @each("prior", [Beta(1.0, 3.0), Beta(10.0, 1.0), Beta(1.0, 1.0)])
 def test_a_beta_with_a_shape_of_one(prior: Beta, dtype: type) -> None:
     """Its value, a finite density everywhere, and the standard normal one where values have it."""

@@ -27,7 +27,7 @@ from polar_bayes.progress import Progress
 
 COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
 """XLA's optimization level, of 0 to 3: fits run as fast as with 3, and the first fit of a layout
-takes three quarters of the time."""
+takes three quarters of the time. What the environment variable XLA_FLAGS says goes before it."""
 
 CONTAINER_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
@@ -92,9 +92,9 @@ def keep_compiled_programs() -> None:
 def compiled(function: Callable) -> Any:
     """Wrap a function in `jax.jit`, with `COMPILER_OPTIONS` on a CPU."""
     keep_compiled_programs()
-    return jax.jit(
-        function, compiler_options=COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
-    )
+    flags = os.environ.get("XLA_FLAGS", "")
+    ours = {name: value for name, value in COMPILER_OPTIONS.items() if name not in flags}
+    return jax.jit(function, compiler_options=ours if jax.default_backend() == "cpu" else None)
 
 
 class JitOnce:

@@ -79,7 +79,7 @@ def test_an_index_that_the_prior_allows_is_none(name, tmp_path, capsys):
     assert not told.err
 
 
-@each("name", BEYOND)
+@each("name", BEYOND, quick=1)
 def test_a_fit_says_that_its_prior_excludes_the_index(name, tmp_path, capsys):
     """Also one that is read from its file, without the capture."""
     capture = imported(name, tmp_path)

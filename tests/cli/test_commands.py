@@ -37,6 +37,7 @@ def test_the_table_has_a_row_per_parameter(plate, tmp_path, capsys) -> None:
     assert out.exists()
 
 
+@pytest.mark.thorough
 def test_a_fit_whose_diagnostics_fail_is_written_and_exits_with_2(
     plate: Path, plate_scene: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
 ) -> None:

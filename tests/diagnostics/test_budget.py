@@ -174,6 +174,7 @@ def test_a_set_up_that_states_nothing_has_no_budget(capture, perfect) -> None:
         pb.fit(capture, known={"sample_lean": 0.1}, **PERFECT)
 
 
+@pytest.mark.thorough
 def test_a_model_that_does_not_know_of_a_quantity_is_fitted_without(capture, perfect) -> None:
     def own(data, scene, priors, links):
         given = {

@@ -32,7 +32,7 @@ from polar_bayes.physics.subsurface import Lambertian, body_loss, half_space_los
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 
 BOUND = {np.float64: 1e-10, np.float32: 1e-4}
-PRECISIONS = each("dtype", [np.float64, np.float32])
+PRECISIONS = each("dtype", [np.float64, np.float32], quick=1)
 
 
 @pytest.fixture(autouse=True)
@@ -237,7 +237,7 @@ def test_scene_of_a_rough_surface(dtype: type) -> None:
 
 
 @PRECISIONS
-@each("mixing", [StokesMixing(), DopMixing(), DopMixing(signed=True)])
+@each("mixing", [StokesMixing(), DopMixing(), DopMixing(signed=True)], quick=1)
 def test_scene_of_a_plate_over_a_diffuse_body(mixing, dtype):
     """q and u against the degree of polarization of the stronger part."""
     cases = every_case(dtype, exact=True)

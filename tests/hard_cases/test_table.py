@@ -11,7 +11,7 @@ from hard_cases.table import CASES, error
 PAGE = Path(__file__).parents[2] / "docs" / "hard_cases.md"
 BOUND = {np.float64: 1e-10, np.float32: 1e-4}
 
-of_every_case = each("case", CASES, ids=lambda case: f"{case.what}, {case.where}")
+of_every_case = each("case", CASES, ids=lambda case: f"{case.what}, {case.where}", quick=8)
 
 
 @of_every_case

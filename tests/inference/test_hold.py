@@ -54,7 +54,7 @@ def test_the_density_is_that_of_the_others() -> None:
         assert (held.constrain(draws.z)["slope"] == slope).all()
 
 
-@each("precision", ["double", "single"])
+@each("precision", ["double", "single"], quick=1)
 def test_densities_are_smooth_at_the_ends_of_supports(precision: str) -> None:
     with jax.enable_x64(precision == "double"):
         here = problem(ends, precision=precision)

@@ -59,6 +59,7 @@ def test_importance_sampling_makes_a_map(image: xr.Dataset, kind: type) -> None:
     assert (alone[NAMES[0]].values == maps[NAMES[0]].values[:1, :1]).all()
 
 
+@pytest.mark.thorough
 def test_a_pixel_without_a_mode_is_searched_by_the_method_of_one_capture(image, monkeypatch):
     one = image.isel(y=[0], x=[0])
     monkeypatch.setattr(importance, "find_all_modes", lambda *_: (np.zeros(0, int), None))

@@ -299,6 +299,7 @@ def test_every_patch_has_its_own_curve_around_a_pooled_level() -> None:
     assert np.abs(apart).max() < 4.0  # 6e-5 each
 
 
+@pytest.mark.thorough
 def test_a_law_of_dispersion_takes_the_place_of_a_process() -> None:
     scene = dataclasses.replace(PLATE, dispersion=pb.physics.Cauchy())
     result = pb.fit(THREE, model=gp_spectral, scene=scene, links=LINKS, method=TINY)

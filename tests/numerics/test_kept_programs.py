@@ -5,7 +5,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
+
+from polar_bayes.numerics.kept_programs import kept_program
+from polar_bayes.paths import compiled_folder
 
 FIT = """
 import sys
@@ -52,6 +58,29 @@ def programs(cache: Path) -> list[Path]:
     return [path for path in cache.rglob("compiled/programs/*/*") if path.is_file()]
 
 
+def test_a_program_is_found_by_its_key_and_its_arguments(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    x, before = jnp.arange(3.0), jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(compiled_folder()))
+    try:
+        kept, other, longer = (
+            kept_program(key, (given,)) for key, given in (("a", x), ("b", x), ("a", jnp.ones(4)))
+        )
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
+    kept.save(jax.jit(lambda x: jnp.sin(x) + 0.123).lower(x).compile())
+    assert len(programs(tmp_path)) == 1
+    assert (kept.exists, other.exists, longer.exists) == (True, False, False)
+    np.testing.assert_allclose(kept.load()(x), np.sin(x) + 0.123, rtol=1e-14)
+    programs(tmp_path)[0].write_bytes(b"half of it")
+    with pytest.warns(UserWarning, match="Error reading persistent compilation cache entry"):
+        assert kept.load() is None
+    assert not kept.exists
+
+
+@pytest.mark.thorough
 def test_the_next_process_traces_no_program_of_the_model_and_finds_the_same(cache, first) -> None:
     kept = programs(cache)
     assert len(kept) >= 4

@@ -224,7 +224,7 @@ def censored_log_probability(row):
     return MeanConcentrationBeta(row[0], row[1], MARGIN, validate_args=False).log_prob(row[2])
 
 
-@each("dtype", [np.float64, np.float32])
+@each("dtype", [np.float64, np.float32], quick=1)
 def test_a_reading_at_the_margin_has_the_probability_beyond_it(dtype):
     """Eight nodes leave .003 of the logarithm up to 30 expected readings within the margin."""
     rows = CENSORED.astype(dtype)

@@ -35,8 +35,8 @@ def polarization(surface: RoughSurface, views: Geometry) -> np.ndarray:
     return np.stack(both(MATERIAL))
 
 
-@each("side", [1.0, -1.0])
-@each("zenith", [0.0, 30.0, 80.0])
+@each("side", [1.0, -1.0], quick=1)
+@each("zenith", [80.0, 0.0, 30.0], quick=1)
 def test_no_facet_turns_its_back(zenith: float, side: float) -> None:
     view = jnp.array([side * zenith])
     ellipse = SlopeEllipse(jnp.array([0.5]), jnp.array([0.5]), None)

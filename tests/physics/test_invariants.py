@@ -205,7 +205,7 @@ MIRRORS = {
 }
 
 
-@each("name", MIRRORS)
+@each("name", MIRRORS, quick=2)
 def test_a_surface_reflects_no_more_than_it_gets(name: str) -> None:
     """For every roughness, groove and angle, in s- and p-polarized light and in plain light.
 

@@ -41,7 +41,9 @@ def scene(source: object, slopes: object, distribution: object = None, **parts: 
 
 
 POINT = scene(PointSource(), ALONG)
-SOURCES = each("source", [PointSource(), Disc(20.0), UniformSky()], ids=["point", "disc", "sky"])
+SOURCES = each(
+    "source", [PointSource(), Disc(20.0), UniformSky()], ids=["point", "disc", "sky"], quick=1
+)
 VIEWS = {
     "view_zenith": np.array([0.0, 30.0, 60.0, 80.0]),
     "view_azimuth": np.array([0.0, 20.0, -70.0, 160.0]),
@@ -170,7 +172,7 @@ def test_the_default_serves_steep_grooves_from_any_side(name: str) -> None:
 
 
 @each("name", DISTRIBUTIONS)
-@each("slopes", [IsotropicSlopes(), ALONG], ids=["isotropic", "grooves"])
+@each("slopes", [IsotropicSlopes(), ALONG], ids=["isotropic", "grooves"], quick=1)
 def test_facets_of_a_smooth_surface_sum_to_one(name: str, slopes: object) -> None:
     """Under a sky a surface as smooth as can be is a mirror; nodes of GGX were .0015 short."""
     views = jnp.array([0.0, 30.0, 56.0, 80.0])

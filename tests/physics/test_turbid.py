@@ -145,6 +145,7 @@ def test_two_crossed_beams_are_an_unpolarized_one() -> None:
     )
 
 
+@pytest.mark.thorough
 def test_without_internal_reflection_the_body_is_darker() -> None:
     with_it = stokes_of(body(), BODY, VIEWS)[:, 0]
     without = stokes_of(body(internal_reflection=None), BODY, VIEWS)[:, 0]

@@ -65,7 +65,7 @@ def draw(plot: str, result: xr.DataTree) -> arviz_plots.PlotCollection:
     return getattr(arviz_plots, plot)(result)
 
 
-@each("plot", FIRST)
+@each("plot", FIRST, quick=2)
 def test_arviz_draws_what_chains_found(plot: str, fitted) -> None:
     drawn = draw(plot, result_of("nuts", fitted))
     assert drawn.viz["figure"].item().get_axes()

@@ -120,6 +120,7 @@ def small_library(*_: object) -> SceneLibrary:
     )
 
 
+@pytest.mark.thorough
 def test_scenes_are_compared_with_an_index_that_the_prior_excludes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -173,6 +173,7 @@ def test_a_pixel_scatters_like_a_capture_of_its_truth():
 # --- light and shadow -----------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_one_exposure_serves_the_whole_image():
     given = {"scene": PLATE, "protocol": GRAY, "links": LINKS}
     noise = {"intensity_scale": 1e-12}
