@@ -9,7 +9,7 @@ A value is one number, one for each wavelength, or an image (y, x): its rank say
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 
 import jax
@@ -20,8 +20,8 @@ from jaxtyping import Array
 
 from polar_bayes.capture.schema import Interval, validate
 from polar_bayes.errors import CaptureError, FitError, SceneError
-from polar_bayes.numerics.compile import LRUCache, compiled
-from polar_bayes.numerics.fingerprint import fingerprint
+from polar_bayes.numerics.compile import JitOnce, LRUCache
+from polar_bayes.numerics.fingerprint import fingerprint, uses_own_code
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink, noise_parameters
 from polar_bayes.physics.geometry import Geometry
@@ -354,7 +354,7 @@ def simulate(
     image = image_shape(truth, levels)
     given = protocol.angles(), wavelengths, truth, levels, np.uint32(seed)
     with jax.enable_x64(True):
-        found = _recorder(setup.scene, links, image)(*given)
+        found = _recorder(setup.scene, links, image, given)(*given)
     recorded = {key: np.asarray(value) for key, value in found.items()}
     name = name or (preset if isinstance(preset, str) else "simulated")
     attributes: dict[str, str | int] = {"name": name, "seed": seed}
@@ -376,16 +376,20 @@ def _checked_links(links: Mapping[str, AbstractLink]) -> dict[str, AbstractLink]
     return dict(links)
 
 
-_RECORDERS: LRUCache[Callable[..., dict[str, Array]]] = LRUCache(16)
+_RECORDERS: LRUCache[JitOnce] = LRUCache(16)
 
 
 def _recorder(
-    scene: Scene, links: Mapping[str, AbstractLink], image: tuple[int, ...]
-) -> Callable[..., dict[str, Array]]:
+    scene: Scene, links: Mapping[str, AbstractLink], image: tuple[int, ...], given: tuple
+) -> JitOnce:
     """Return the compiled `_record` of a scene and its links; new code is compiled again."""
     scene = dataclasses.replace(scene)  # without its ledger
-    key = fingerprint(scene, links, image, code=(scene, links))
-    return _RECORDERS.of(key, lambda: compiled(functools.partial(_record, scene, links, image)))
+    leaves, tree = jax.tree.flatten(given)
+    shapes = str(tree), *map(np.shape, leaves)
+    key = fingerprint(scene, links, image, *shapes, code=(scene, links))
+    kept = "" if uses_own_code(scene, links) else f"readings of {key}"
+    record = functools.partial(_record, scene, links, image)
+    return _RECORDERS.of(key, lambda: JitOnce(record, kept))
 
 
 def _record(

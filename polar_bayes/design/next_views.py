@@ -5,6 +5,7 @@ the posterior (Chaloner & Verdinelli 1995).
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -50,7 +51,6 @@ from polar_bayes.inference.problem import observe_request
 from polar_bayes.inference.program import from_prior
 from polar_bayes.inference.request import resolve
 from polar_bayes.inference.result import capture_of
-from polar_bayes.numerics.compile import compiled
 from polar_bayes.observation.data import ANGLES, Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
@@ -279,9 +279,12 @@ def _design(
         jacobian = jax.jacfwd(lambda z: parameter_vector(program, z, data))(z)
         return information_by_view(reading_information(program, z, data), axes), jacobian
 
-    run = compiled(lambda z, data: jax.lax.map(lambda one: evaluate(one, data), z))
+    # By what its trace depends on beside the model.
+    name = f"information by {axes} of {views.measured} views, brightness {is_predicted}"
+    run = program.once(name, lambda z, data: jax.lax.map(lambda one: evaluate(one, data), z))
     information, jacobian = jax.tree.map(np.asarray, run(z, data))
-    hessian = compiled(lambda z, data: prior_precision(program, z, data))(center, data)
+    precision = program.once("prior precision", functools.partial(prior_precision, program))
+    hessian = precision(center, data)
     size, many = program.size, data.shape[-1]
     by_view = {n: x.reshape(count, -1, many, size, size) for n, x in information.items()}
     base = positive_definite(np.asarray(hessian), extended.prior) + sum(

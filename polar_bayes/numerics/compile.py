@@ -21,7 +21,12 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 
 from polar_bayes.errors import FitError
-from polar_bayes.numerics.kept_programs import KeptProgram, cache_hits, kept_program
+from polar_bayes.numerics.kept_programs import (
+    KeptProgram,
+    cache_hits,
+    kept_program,
+    of_this_version,
+)
 from polar_bayes.paths import compiled_folder, make_private
 from polar_bayes.progress import Progress
 
@@ -106,7 +111,7 @@ class JitOnce:
 
     def __init__(self, function: Callable, key: str = "") -> None:
         self.key = key
-        self._function = compiled(function)
+        self._function = compiled(of_this_version(function) if key else function)
         self._compilations: dict[Hashable, _Compilation] = {}
 
     @property
@@ -180,7 +185,7 @@ class _Compilation:
             return found
         hits = cache_hits()
         found = compile_now()
-        # XLA cannot write a program again that JAX's own cache has read.
+        # XLA cannot write a program again that JAX's own cache has read; see `of_this_version`.
         if self._kept is not None and cache_hits() == hits:
             _COMPILER_THREAD.submit(self._kept.save, found)
         return found

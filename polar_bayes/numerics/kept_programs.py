@@ -109,6 +109,20 @@ def kept_program(key: str, arguments: tuple) -> KeptProgram | None:
     return KeptProgram(folder / "programs" / environment / _digest(words), arguments)
 
 
+def of_this_version(function: Callable) -> Callable:
+    """The function by a name that no other version of what a program depends on gives it.
+
+    JAX's own cache tells programs apart by name, too, so that it has none of another version, which
+    could be run but not kept.
+    """
+
+    def run(*arguments: Any) -> Any:
+        return function(*arguments)
+
+    run.__name__ = f"{getattr(function, '__name__', 'run')}_{_environment()[:8]}"
+    return run
+
+
 def _described(leaf: Any) -> str:
     like = leaf if isinstance(leaf, jax.ShapeDtypeStruct) else jax.typeof(leaf)
     return f"{like.dtype}{like.shape}{like.weak_type}"
