@@ -598,12 +598,12 @@ def _accuracy(result: xr.DataTree) -> Iterator[page.Block]:
 
 
 def provenance_facts(provenance: Provenance) -> list[page.Block]:
-    """Return the provenance in titled groups of names and values; swapped parts are marked."""
+    """Return the provenance in titled groups of names and values; parts that the user replaced are marked."""
     keys = ["method", "settings", "model", "scene", "scene_parts", "seed", "precision"]
     keys += ["chain_method", "step_size_halvings", "largest_view_zenith"]
     fit = {key.replace("_", " "): provenance[key] for key in keys if key in provenance}
     swapped = [str(name) for name in provenance.get("swapped") or ()]
-    fit["swapped by the user"] = swapped or "nothing: all defaults"
+    fit["replaced by the user"] = swapped or "nothing: all defaults"
     groups = {name: provenance.get(name) or {} for name in PROVENANCE_GROUPS}
     groups["priors"] = {n: short_numbers(str(x)) for n, x in groups["priors"].items()}
     if timings := groups["timings"]:
@@ -624,7 +624,7 @@ def provenance_facts(provenance: Provenance) -> list[page.Block]:
             values,
             PROVENANCE_GROUPS.get(name, "Fit"),
             marked=marked.get(name, ()),
-            mark="swapped",
+            mark="replaced",
         )
     ]
 

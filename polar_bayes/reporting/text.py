@@ -168,9 +168,11 @@ def swapped_sentence(provenance: Provenance) -> str:
     parts = [f"the {n}" for n in swapped if not n.startswith(PRIOR) and not n.endswith(HELD)]
     if priors:
         parts.append(f"the prior{'s' if len(priors) > 1 else ''} of {join_first(priors)}")
-    sentences = [f"Swapped by the user: {join(parts)}."] if parts else []
+    sentences = [f"Replaced by the user: {join(parts)}."] if parts else []
     sentences += [f"Held fixed: {join_first(held)}."] if held else []
-    return " ".join(sentences) or "Nothing was swapped: all parts and priors are as shipped."
+    return " ".join(sentences) or (
+        "No part of the model was replaced: scene, links and priors are the defaults of the package."
+    )
 
 
 def determined(fit: FitView) -> list[str]:
