@@ -216,8 +216,8 @@ def _refuse_swapped(capture: xr.Dataset) -> None:
     if total >= 3 and below >= 0.9 * total:
         what = f"s lies below p at {below} of {total} angles, which no reflecting surface does"
         hint = (
-            "swap s= and p=, or give s_incident= and p_incident= where the channels differ in gain; "
-            "a coating that reflects more p light is imported by pb.from_table, as q"
+            "swap s= and p=, or give s_incident= and p_incident= where the channels differ in "
+            "gain; a coating that reflects more p light is imported by pb.from_table, as q"
         )
         raise CaptureError(what, where=capture.attrs["name"], hint=hint)
 

@@ -174,8 +174,8 @@ def _check_constants(
         if row.kind == "geometry" and row.name not in {*columns, *constants}:
             mirror = "; or name the column of a mirror's angle by angle=" * ("zenith" in row.name)
             hint = (
-                f"name its column by columns={{'{row.name}': COLUMN}}, or the value of all lines by "
-                f"constants={{'{row.name}': NUMBER}} ({row.hint}){mirror}"
+                f"name its column by columns={{'{row.name}': COLUMN}}, or the value of all lines "
+                f"by constants={{'{row.name}': NUMBER}} ({row.hint}){mirror}"
             )
             raise CaptureError(f"nothing gives {row.name}", where=source, hint=hint)
 

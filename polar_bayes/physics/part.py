@@ -216,9 +216,7 @@ NOTATION: dict[str, Quantity] = {
     "logit_scale": Quantity("", "noise of the log odds of dop"),
     "normal_scale": Quantity("", "noise of the readings"),
     "stokes_scale": Quantity("", "noise of q and u in full light"),
-    "stokes_error_factor": Quantity(
-        "", "true errors of the Stokes parameters over those in the capture"
-    ),
+    "stokes_error_factor": Quantity("", "true errors of q and u over those in the capture"),
     "exposure": Quantity("", "recorded over predicted intensity"),
     "intensity_scale": Quantity("", "noise of the intensity"),
 }

@@ -14,6 +14,7 @@ from polar_bayes.benchmark.advice import accuracy_sentences, accuracy_view
 from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.alternatives import alternatives
 from polar_bayes.diagnostics.budget import (
+    DISCREPANCY,
     budget,
     budget_sentences,
     described,
@@ -421,6 +422,7 @@ def budget_table(fit: FitView) -> Table:
     data = variance_shares(found).T
     descriptions = {"sd": "of the posterior", "perfect": "in a set-up that is known perfectly"}
     descriptions |= {"noise": "of the readings", "prior": "of the other parameters"}
+    descriptions[DISCREPANCY] = "smooth errors over angle of unknown shape"
     for quantity, u in found.attrs["known"].items():
         descriptions[quantity] = ", ± ".join(described(fit, quantity, u))
 
@@ -598,7 +600,7 @@ def _accuracy(result: xr.DataTree) -> Iterator[page.Block]:
 
 
 def provenance_facts(provenance: Provenance) -> list[page.Block]:
-    """Return the provenance in titled groups of names and values; parts that the user replaced are marked."""
+    """Return the provenance in titled groups; what the user replaced is marked."""
     keys = ["method", "settings", "model", "scene", "scene_parts", "seed", "precision"]
     keys += ["chain_method", "step_size_halvings", "largest_view_zenith"]
     fit = {key.replace("_", " "): provenance[key] for key in keys if key in provenance}

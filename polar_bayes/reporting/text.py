@@ -171,7 +171,7 @@ def swapped_sentence(provenance: Provenance) -> str:
     sentences = [f"Replaced by the user: {join(parts)}."] if parts else []
     sentences += [f"Held fixed: {join_first(held)}."] if held else []
     return " ".join(sentences) or (
-        "No part of the model was replaced: scene, links and priors are the defaults of the package."
+        "No part of the model was replaced: scene, links and priors are the package's defaults."
     )
 
 

@@ -83,7 +83,7 @@ def test_no_sentence_of_an_import_keeps_an_argument_of_python() -> None:
         f"{path.name}: {said}"
         for path in (ROOT / "polar_bayes" / "importers").rglob("*.py")
         for text in _texts(ast.parse(path.read_text()))
-        if " " in text and argument.search(said := as_commands(text))
+        if " " in text and re.search(argument, said := as_commands(text))
     ]
     assert not left
 
@@ -113,7 +113,8 @@ READINGS = "angle;perp;parallel\n20;47;36\n30;51;33\n40;58;27\n"
             ["--s-incident and --p-incident, or neither"],
         ),
         (
-            ["goniometer", "--table", "{}", "--angle", "angle", "--s", "perp", "--dark-level", "60"],
+            ["goniometer", "--table", "{}", "--angle", "angle", "--s", "perp", "--dark-level",
+             "60"],
             ["the right --dark-level, or the noise without light by --s-error"],
         ),
         (["ellipsometer", "--table", "{}", "--psi", "perp"], ["or degrees, by --angle"]),

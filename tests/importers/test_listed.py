@@ -153,7 +153,7 @@ REFUSED = [
         "view_zenith,DoLP\n10,.1\n",
         {},
         "column DoLP: a capture has no variable",
-        "say which variable it is",
+        "say which",
     ),
     (
         "view_zenith,dop\n# x\n10,.1\n20,12\n",

@@ -132,7 +132,8 @@ def test_tables_have_a_cell_for_every_head() -> None:
         (["scene"], "Replaced by the user: the scene."),
         (
             ["scene", "model", "prior of roughness", "prior of absorption"],
-            "Replaced by the user: the scene, the model and the priors of roughness and absorption.",
+            "Replaced by the user: the scene, the model and the priors of roughness and "
+            "absorption.",
         ),
         (["refractive_index held fixed"], "Held fixed: refractive_index."),
         (
