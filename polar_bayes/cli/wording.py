@@ -72,6 +72,7 @@ RULES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"goes with pb\.fit only", "is fitted in Python only"),
     (r"fit with load_scene and model= in Python", "fit it in Python"),
     (r"polar_bayes\.save or (?=a command)", ""),
+    (r"constraints=pb\.design\.Constraints\([^)]*\), or (?=polar-bayes identify)", ""),
     (r", or pb\.from_table\([^)]*\)", ""),
     (r", as by capture\['valid'\] = capture\['\w+'\]\.notnull\(\)", ""),
     (r"select one with isel\([^)]*\), or ", ""),

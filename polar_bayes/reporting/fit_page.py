@@ -94,11 +94,12 @@ def fit_page(result: xr.DataTree | FitView) -> page.Page:
     """Return the page of a fit."""
     fit = view_of(result)
     judged = convergence.verdict(fit)
+    answers: list[str] = []
     sentences: list[str] = []
     if judged.passed:
-        sentences = [*text.index_sentences(fit), text.trust(fit), text.next_sentence(fit.result)]
-        sentences += text.setup_beside_views(fit)
-        sentences += [*text.determined(fit), *text.between_members(fit)]
+        further = [text.next_sentence(fit.result), *text.setup_beside_views(fit)]
+        answers = [" ".join(text.index_sentences(fit)), text.trust(fit), " ".join(further)]
+        sentences = [*text.determined(fit), *text.between_members(fit)]
     approximation = "Convergence" if fit.method == "nuts" else "Approximation"
     code = str(fit.provenance.get("model_source") or "")
     source = [page.Details("Source of the model", code=code)] if code else []
@@ -133,6 +134,7 @@ def fit_page(result: xr.DataTree | FitView) -> page.Page:
         headline=text.fit_headline(fit),
         passed=judged.passed,
         problems=judged.problems,
+        answers=tuple(zip(text.QUESTIONS, answers, strict=False)),
         sentences=[*sentences, *text.notes(judged)],
         cautions=judged.cautions,
         beside=_glance(fit) if plots_curves.variables(fit) else None,
