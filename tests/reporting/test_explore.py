@@ -139,6 +139,27 @@ def test_fitted_values_are_those_of_a_textbook_at_the_posterior_means(monkeypatc
     assert about["is_joined"]
 
 
+@pytest.mark.usefixtures("compiled_in_haste")
+def test_a_map_in_a_store_is_predicted_with_what_its_pixels_share(tmp_path: Path) -> None:
+    capture = plate_image(9, 10, seed=4)
+    pb.save_capture(capture, tmp_path / "image.nc")
+    asked = {"scene": PLATE, "links": LINKS, "shared": ("stokes_error_factor",)}
+    pb.maps.map_file(tmp_path / "image.nc", tmp_path / "maps.zarr", **asked)
+    maps = pb.maps.open_map(tmp_path / "maps.zarr")
+    titles = shown_parameters(maps)
+    assert {scalar.name for scalar in titles} == {"refractive_index", "subsurface_fraction"}
+    assert list(pb.maps.shared_parameters(maps).index) == ["stokes_error_factor"]
+    about, arrays, _ = map_readings(maps, capture)
+    measured, fitted = (decoded(x, about["panels"][0]["scale"]) for x in arrays["readings"][0])
+    means = (maps[n].to_numpy()[..., None] for n in ("refractive_index", "subsurface_fraction"))
+    expected = plate_q(*means, np.radians(VIEWS)).ravel()
+    known = np.isfinite(fitted)
+    assert known.mean() > 0.9
+    np.testing.assert_allclose(fitted[known], expected[known], rtol=0.0, atol=1e-4)
+    np.testing.assert_allclose(measured, capture["q"].to_numpy().ravel(), rtol=0.0, atol=1e-4)
+    assert "refractive index n" in pb.explore(maps, capture).html
+
+
 def test_each_pixel_may_have_directions_of_its_own() -> None:
     maps, capture = plates()
     shifted = capture["view_zenith"] + xr.DataArray(np.linspace(-5.0, 5.0, 9), dims="x")
