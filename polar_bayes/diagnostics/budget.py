@@ -206,6 +206,6 @@ def budget_sentences(fit: FitView) -> tuple[str, ...]:
     (what, sd), now = better_known(fit, worst), budget(fit).loc[worst, "sd"]
     factors = join([f"{label} {factor:.2g} times" for label, factor in wider.items()])
     return (
-        "What the set-up is known to makes standard uncertainties larger than those of a perfect "
+        "The uncertainty of the set-up makes standard uncertainties larger than those of a perfect "
         f"one: {factors}. That of {worst} would be {sd:.2g} instead of {now:.2g} with the {what}.",
     )

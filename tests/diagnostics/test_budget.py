@@ -130,7 +130,7 @@ def test_it_is_kept_in_a_file_and_the_verdict_names_what_to_know_better(fit, tmp
     (sentence,) = budget_sentences(loaded)
     assert sentence in pb.verdict(loaded).findings
     assert sentence.startswith(
-        "What the set-up is known to makes standard uncertainties larger than"
+        "The uncertainty of the set-up makes standard uncertainties larger than"
     )
     what, sd = better_known(view_of(fit), "refractive_index")
     assert what == "exponent of the sensor's tone curve known to 0.01 instead of 0.02"
