@@ -126,8 +126,8 @@ def test_tables_have_a_cell_for_every_head() -> None:
     [
         (
             [],
-            "No part of the model was replaced: scene, links and priors are the defaults of the "
-            "package.",
+            "No part of the model was replaced: scene, links and priors are the package's "
+            "defaults.",
         ),
         (["scene"], "Replaced by the user: the scene."),
         (
