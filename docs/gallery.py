@@ -1,7 +1,7 @@
 # %% [markdown]
 # # Gallery
 #
-# Twelve pictures, each with the lines that make it. All captures are simulated, so the truth is
+# Thirteen pictures, each with the lines that make it. All captures are simulated, so the truth is
 # known, and the settings are small, so that a laptop draws each picture in less than a minute. The
 # colors are those of Okabe and Ito, which color-blind people can distinguish.
 #
@@ -112,6 +112,15 @@ noise = {"stokes_scale": np.where(np.hypot(y, x) < 10.0, 0.01, 0.002)}
 image = pb.simulate("plastic", protocol=arc, parameters=truth, noise=noise, **asked)
 maps = pb.fit_pixels(image, method="laplace", **asked)
 pb.plots.plot_maps(maps)
+
+# %% [markdown]
+# ## A map to point at
+#
+# Pointing at a pixel shows its parameters with their intervals, and a click shows [its readings
+# and fitted values](maps.md#a-map-to-point-at). The slider hides pixels whose interval is wide.
+
+# %%
+pb.explore(maps, image)
 
 # %% [markdown]
 # ## Means of regions

@@ -141,7 +141,7 @@ held = pb.fit(capture, model=known, **robust)
 pb.summary(held)[columns].round(3)
 
 # %% [markdown]
-# What was swapped is saved with the result, and its report shows it:
+# What was replaced is saved with the result, and its report shows it:
 
 # %%
 said = provenance_of(held)

@@ -16,6 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
+ASSUMED = "assumed by the import"
+"""Value of the attribute `errors` of a capture whose errors nobody stated."""
+
 SMALLEST_VIEWS = 3
 """Smallest number of views from whose polarization anything is concluded."""
 PURE_PEAK = 0.9
@@ -367,7 +370,8 @@ def _scale_cautions(name: str, capture: xr.Dataset) -> Iterator[str]:
 
 def _readings_sentence(capture: xr.Dataset) -> str:
     signals = [name for name in ("dop", "q", "u", "intensity") if name in capture]
-    names = [f"{n} ({'' if f'{n}_error' in capture else 'no '}errors stated)" for n in signals]
+    errors = f"errors {capture.attrs.get('errors', 'stated')}"
+    names = [f"{n} ({errors if f'{n}_error' in capture else 'no errors stated'})" for n in signals]
     zenith = capture["view_zenith"]
     views = capture.sizes["view"]
     mirror = int(_at_mirror(capture).any([x for x in zenith.dims if x != "view"]).sum())

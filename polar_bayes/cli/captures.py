@@ -113,8 +113,9 @@ def _numbered(names: list[str]) -> list[str]:
     return labels
 
 
+SET_BY = Name("way to set angles", ("stage", "hand", "lens"), CaptureError)
 angle_option = option(
-    "--angle-set-by", default="hand",
+    "--angle-set-by", type=SET_BY, default="hand",
     help="How the angles were set (stage, hand or lens): how far their zero may be off.",
 )  # fmt: skip
 
@@ -189,7 +190,7 @@ def goniometer(out: Path, **settings: Any) -> None:
 @option("--psi-error", help="Error of psi, or its column.  [default: 0.1 degrees]")
 @option("--delta-error", help="Error of delta, or its column.  [default: 0.2 degrees]")
 @sheet_option
-@option("--angle-set-by", default="stage", help="stage, hand or lens.")
+@option("--angle-set-by", type=SET_BY, default="stage", help="stage, hand or lens.")
 @name_option
 @out_capture
 def ellipsometer(table: Path, out: Path, wavelength: tuple[str, ...], **settings: Any) -> None:

@@ -114,6 +114,10 @@ def calibrate(
     "--criterion", default="D",
     help="What they should narrow: D (all parameters together), A (each), or one parameter.",
 )  # fmt: skip
+@option(
+    "--from-light", type=click.FloatRange(0.0, 180.0), default=0.0, metavar="DEGREES",
+    help="Smallest angle between light and viewer that the set-up can take in a next view.",
+)  # fmt: skip
 @seed_option
 @json_option
 def identify(
@@ -121,10 +125,13 @@ def identify(
     profiled: tuple[str, ...],
     count: int | None,
     criterion: str,
+    from_light: float,
     as_json: bool,
     **settings: Any,
 ) -> None:
     """Show which parameters a capture determines, which trade off, and where to look next."""
+    if from_light and count is None:
+        raise click.UsageError("--from-light needs --next-views")
     data, settings = pb.load_capture(capture), read_scene_options(settings)
     with stages() as progress:
         settings["progress"] = progress
@@ -134,7 +141,10 @@ def identify(
         if count is not None:
             goals = {"D": pb.design.DOptimal(), "A": pb.design.AOptimal()}
             goal = goals.get(criterion) or pb.design.SingleParameter(criterion)
-            results["next views"] = pb.next_views(data, count=count, criterion=goal, **settings)
+            limits = pb.design.Constraints(from_light=from_light)
+            results["next views"] = pb.next_views(
+                data, count=count, criterion=goal, constraints=limits, **settings
+            )
     found = {name: (pb.summary(each), pb.verdict(each).sentences) for name, each in results.items()}
     if as_json:
         rows: dict[str, object] = {name: json_rows(table) for name, (table, _) in found.items()}

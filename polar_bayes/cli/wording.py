@@ -22,6 +22,8 @@ FUNCTIONS = {
     "compare_fits": "compare",
     "compare_scenes": "scenes",
     "fit_pixels": "map",
+    "from_goniometer": "import goniometer",
+    "from_table": "import table",
     "maps.count_pixels": "report",
     "next_views": "identify",
     "profile": "identify",
@@ -29,16 +31,27 @@ FUNCTIONS = {
 }
 """Functions, and the command that calls each of them."""
 
+OF_IMPORTS = (
+    *("angle", "angle_is", "angle_set_by", "aolp_from", "bin", "color", "dark", "dark_level"),
+    *("delta", "delta_error", "flat", "gain", "layout", "mueller", "p", "p_error", "p_incident"),
+    *("psi", "psi_error", "read_noise", "relative_error", "s", "s_error", "s_incident"),
+    *("saturation_level", "sheet", "table", "transfer", "unit", "unpolarized", "wavelength"),
+    "window",
+)
+"""Keyword arguments of imports, which their errors also begin with."""
+
 KEYWORDS = {
     **{
         name: f"--{name.replace('_', '-')}"
         for name in (
-            *("angle", "angle_is", "aolp_from", "color", "delta", "dim", "drop", "keep", "method"),
-            *("model", "mueller", "p", "precision", "preset", "psi", "s", "saturation_level"),
-            *("scene", "scheduler", "seed", "setup", "sheet", "table", "transfer", "truth"),
-            *("unit", "wavelength"),
+            *OF_IMPORTS,
+            *("dim", "drop", "keep", "method", "model", "precision", "preset", "scene"),
+            *("scheduler", "seed", "setup", "truth"),
         )
     },
+    "columns": "--column",
+    "constants": "--constant",
+    "ignored": "--ignore",
     "links": "--link",
     "parameter": "--profile",
     "priors": "--prior",
@@ -59,11 +72,18 @@ RULES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"goes with pb\.fit only", "is fitted in Python only"),
     (r"fit with load_scene and model= in Python", "fit it in Python"),
     (r"polar_bayes\.save or (?=a command)", ""),
+    (r"constraints=pb\.design\.Constraints\([^)]*\), or (?=polar-bayes identify)", ""),
     (r", or pb\.from_table\([^)]*\)", ""),
     (r", as by capture\['valid'\] = capture\['\w+'\]\.notnull\(\)", ""),
     (r"select one with isel\([^)]*\), or ", ""),
     (r", for example capture\.mean\(.*?\)\)", ", or fit each pixel with polar-bayes map"),
+    (r"a table or a pair of arrays", "a table, or a column of --table"),
     # Variables of a capture, which a table has as columns.
+    (r"columns=\{'(\w+)': COLUMN\}", r"--column \1 COLUMN"),
+    (r"columns=\{VARIABLE: '([^']*)'\}",
+     lambda found: f"--column VARIABLE {shlex.quote(found[1])}"),
+    (r"constants=\{'(\w+)': NUMBER\}", r"--constant \1 NUMBER"),
+    (r"ignored=\['([^']*)'\]", lambda found: f"--ignore {shlex.quote(found[1])}"),
     (r"\bvalid=(False|True)", lambda found: f"{int(found[1] == 'True')} in column valid"),
     (r"drop_vars\('([^']*)'\)", r"--drop \1"),
     (r"drop=\['[^']*'\], in a command (?=--drop)", ""),
@@ -86,13 +106,14 @@ RULES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"truth=capture", "--truth"),
     (r"\btransfer=(GAMMA|\d+\.?\d*)", r"--transfer \1"),
     (rf"\b({KEYWORD})='([^']*)'(?: or '([^']*)')?", lambda found: _option(*found.groups())),
-    (rf"{FREE}({KEYWORD})=(?=[\s,;)]|\.\s|\.?$)", lambda found: KEYWORDS[found[1]]),
+    (rf"{FREE}({KEYWORD})=(?=[\s,;:)]|\.\s|\.?$)", lambda found: KEYWORDS[found[1]]),
     (rf"give the tree (that|as) (?={PACKAGE})", r"give the file \1 "),
     (rf"({PACKAGE}(?:{FUNCTION}))(?: or load)? return(?:ed|s)\b", r"\1 wrote"),
     (r", or a polar_bayes\.Scene", ", or a scene file"),
     (rf"{PACKAGE}compare_scenes|\bcompare_scenes(?!:)",
      lambda _: f"polar-bayes scenes {_capture()}"),
     (rf"{PACKAGE}({FUNCTION})\b", lambda found: f"polar-bayes {FUNCTIONS[found[1]]}"),
+    (rf"^({'|'.join(OF_IMPORTS)}):", lambda found: f"{KEYWORDS[found[1]]}:"),
     (rf"^({FUNCTION}):", lambda found: f"{FUNCTIONS[found[1]]}:"),
 )  # fmt: skip
 """Patterns and their replacements, applied in this order."""

@@ -50,7 +50,7 @@ from polar_bayes.inference.compiled_model import compile_model
 from polar_bayes.inference.problem import observe_request
 from polar_bayes.inference.program import from_prior
 from polar_bayes.inference.request import resolve
-from polar_bayes.inference.result import capture_of
+from polar_bayes.inference.result import capture_of, provenance_of
 from polar_bayes.observation.data import ANGLES, Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
@@ -217,7 +217,12 @@ def _selected(
     conflicts = design.conflicts(constraints.conflicts(views.directions), constraints.repeatable)
     options = allowed[design.view] & useful
     selection = fedorov_exchange(loss, design.base, design.each, options, conflicts, count)
-    asked = {"criterion": repr(criterion), "constraints": repr(constraints)}
+    zenith = views.directions[design.view[options], 0]
+    asked = {
+        "criterion": repr(criterion),
+        "constraints": repr(constraints),
+        "limits": [float(zenith.min()), float(zenith.max()), constraints.from_light],
+    }
     provenance = provenance_attrs(request, **asked, exchanges=selection.exchanges)
     return _assemble(views, design, selection, names).assign_attrs(provenance)
 
@@ -365,7 +370,20 @@ def next_views_sentences(found: xr.Dataset) -> list[str]:
     ]
     if not helped.all():
         sentences.append(f"These views hardly help {', '.join(names[~helped])}.")
-    return sentences
+    return [*sentences, *_limits_sentences(found)]
+
+
+def _limits_sentences(found: xr.Dataset) -> list[str]:
+    """State the limits within which views were chosen, and how to narrow them."""
+    if "limits" not in (about := provenance_of(found)):
+        return []
+    low, high, apart = about["limits"]
+    near = f"at least {apart:g} degrees from the light" if apart else "however near to the light"
+    return [
+        f"Candidates had zeniths from {low:g} to {high:g} degrees, {near}; where light and viewer "
+        "would collide, state their smallest angle by "
+        "constraints=pb.design.Constraints(from_light=30), or polar-bayes identify --from-light 30."
+    ]
 
 
 def _view_texts(found: xr.Dataset) -> list[str]:

@@ -7,6 +7,7 @@ $$ c = \operatorname{Cov}(\theta, e) / u $$
 
 over the posterior. Of a normal posterior the squares of all contributions add to the variance: each
 factor of the density, with precision P, contributes $\Sigma P \Sigma$ to the covariance $\Sigma$.
+A smooth error of the model contributes by its weights, each of standard uncertainty 1, together.
 What is left is divided between the noise of the readings and the other priors as power scaling
 divides it. These are the noise and smoothing errors of an optimal estimate.
 
@@ -32,6 +33,9 @@ from polar_bayes.frames import PrintedFrame
 from polar_bayes.physics.part import notation
 from polar_bayes.setups import check_uncertainty
 
+WEIGHTS, DISCREPANCY = "discrepancy_weights", "model discrepancy"
+"""Parameters of a smooth error over angle, and their row in the table."""
+
 
 def budget(
     result: xr.DataTree | FitView, *, known: Mapping[str, float] | None = None
@@ -47,8 +51,9 @@ def budget(
     Returns:
         A row for each scalar parameter of the material, in its unit: the posterior's standard
         deviation `sd`; `perfect`, what it would be in a set-up known perfectly; and what
-        contributes to `sd`, in squares: the `noise`, the `prior`, and each input quantity, which
-        has a sign. The attribute `known` has the standard uncertainties of the quantities.
+        contributes to `sd`, in squares: the `noise`, the `prior`, the `model discrepancy` where the
+        scene has one, and each input quantity, which has a sign. The attribute `known` has the
+        standard uncertainties of the quantities.
 
     Raises:
         FitError: The result is no fit, its scene has no input quantity, or none of that name.
@@ -63,17 +68,19 @@ def budget(
     errors, stated = _errors(fit), _stated(fit)
     asked = _asked(stated, known or {})
     # Of the readings, and of all priors but those of the input quantities.
-    names = {each.name for each in errors.values()}
+    weights = {each.label: each for each in fit.scalars if each.name == WEIGHTS}
+    names = {each.name for each in (*errors.values(), *weights.values())}
     likelihood = total_density(fit.result, "log_likelihood")
     densities = [likelihood, total_density(fit.result, "log_prior", names)]
     rows = {}
     for scalar in fit.scalars:
         if scalar.is_material:
             with np.errstate(all="ignore"):  # draws of a damaged file may be huge
-                joint = _covariance(scalar, errors)
+                joint = _covariance(scalar, {**errors, **weights})
                 noise = _share_of_noise(scalar, densities)
                 rows[scalar.label] = _row(joint, noise, stated, asked)
-    columns = ["sd", "perfect", "noise", "prior", *stated.index]
+    smooth = [DISCREPANCY] if weights else []
+    columns = ["sd", "perfect", "noise", "prior", *smooth, *stated.index]
     table = PrintedFrame.from_dict(rows, orient="index", columns=columns)
     table.attrs["known"] = asked.to_dict()
     return table
@@ -105,14 +112,18 @@ def _row(
     joint: Float[np.ndarray, "n n"], noise: float, stated: pd.Series, asked: pd.Series
 ) -> list[float]:
     """Return the sd of one parameter, its sd for a perfect set-up, and all contributions."""
+    count, weights = len(stated), np.ones(len(joint) - 1 - len(stated))  # weights are last
     if not np.isfinite(joint).all():
-        return [np.nan] * (4 + len(stated))
-    variance, with_errors = _known_otherwise(joint, stated, asked)
-    perfect = joint[0, 0] - joint[0, 1:] @ np.linalg.lstsq(joint[1:, 1:], joint[0, 1:])[0]
-    parts = with_errors / asked.to_numpy()
+        return [np.nan] * (4 + bool(weights.size) + count)
+    known, now = (pd.Series([*each, *weights]) for each in (stated, asked))
+    variance, with_errors = _known_otherwise(joint, known, now)
+    own = joint[1 : count + 1, 1 : count + 1], joint[0, 1 : count + 1]
+    perfect = joint[0, 0] - own[1] @ np.linalg.lstsq(*own)[0]
+    parts = with_errors / now.to_numpy()
     rest = variance - np.sum(parts**2)
-    variances = (variance, perfect, noise * rest, (1.0 - noise) * rest)
-    return [*np.sqrt(np.maximum(variances, 0.0)), *parts]
+    variances = [variance, perfect, noise * rest, (1.0 - noise) * rest]
+    variances += [np.sum(parts[count:] ** 2)] if weights.size else []
+    return [*np.sqrt(np.maximum(variances, 0.0)), *parts[:count]]
 
 
 def _known_otherwise(
@@ -195,6 +206,6 @@ def budget_sentences(fit: FitView) -> tuple[str, ...]:
     (what, sd), now = better_known(fit, worst), budget(fit).loc[worst, "sd"]
     factors = join([f"{label} {factor:.2g} times" for label, factor in wider.items()])
     return (
-        "What the set-up is known to makes standard uncertainties larger than those of a perfect "
+        "The uncertainty of the set-up makes standard uncertainties larger than those of a perfect "
         f"one: {factors}. That of {worst} would be {sd:.2g} instead of {now:.2g} with the {what}.",
     )

@@ -19,7 +19,7 @@ import xarray as xr
 from arviz_stats.base import array_stats
 from scipy.special import logsumexp
 
-from polar_bayes.capture.plausibility import IndexByEye, index_sentences
+from polar_bayes.capture.plausibility import ASSUMED, IndexByEye, index_sentences
 from polar_bayes.diagnostics.alternatives import NOTHING, alternatives
 from polar_bayes.diagnostics.finding import Finding, join, judged_by, listed, p_text
 from polar_bayes.diagnostics.limits import LIMITS
@@ -229,7 +229,7 @@ def _without(scalar: Scalar, absent: Sequence[Scalar]) -> float:
 
 
 def _noise(fit: FitView) -> Finding:
-    """Check the scatter of readings against the noise priors and the stated errors."""
+    """Check the scatter of readings against the noise priors and the errors in the capture."""
     noise = [s for s in fit.scalars if s.name in PERFECT and np.isfinite(s.draws).all()]
     below = _prior_probability(fit, noise)
     worse = {
@@ -245,19 +245,21 @@ def _noise(fit: FitView) -> Finding:
         "look at the residuals in the report, and try polar_bayes.compare_scenes."
     )
     least = "passed"
+    is_assumed = (fit.provenance.get("capture") or {}).get("errors") == ASSUMED
+    errors = f"the errors that were {ASSUMED}" if is_assumed else "their stated errors"
     for scalar in (s for s in noise if s.name == NOISE_FACTOR):
         low, high = np.quantile(scalar.draws, CENTRAL_95)
-        factor = f"{np.median(scalar.draws):.3g} times [{low:.3g}, {high:.3g}] their stated errors"
+        factor = f"{np.median(scalar.draws):.3g} times [{low:.3g}, {high:.3g}] {errors}"
         if low > LARGE_FACTOR:
             least = "caution"
             sentence = (
-                f"The readings scatter {factor}: the errors are stated too small, or the scene "
+                f"The readings scatter {factor}: these errors are too small, or the scene "
                 "lacks what the readings show; check the errors, or try polar_bayes.compare_scenes."
             )
         elif high < LIMITS.small_noise_factor:
             least = "note"
             sentence = (
-                f"The readings scatter {factor}: the errors are stated too large, and the fit "
+                f"The readings scatter {factor}: these errors are too large, and the fit "
                 "takes the readings to be as precise as they are."
             )
     return judged_by(p_value, math.nan, sentence, least=least)

@@ -5,7 +5,8 @@ no information, small where they do. Unlike a ratio of widths it is the same for
 logarithm, and it does not take a posterior in the prior's tail for the prior. `width_left` is the
 interval's width over that of the prior, `contraction` 1 - variance over prior variance. The two
 sensitivities are the rates at which the posterior changes when the log priors (all together) or the
-log likelihood are multiplied by a number near 1. The remark names a reading that alone knows a
+log likelihood are multiplied by a number near 1. Whether the data determine a parameter is decided
+by `prior_inside` alone, and no remark contradicts it. The remark names a reading that alone knows a
 parameter, such as the highlight that knows the roughness.
 
 Source: Kallioinen et al. (2024), Statistics and Computing 34, 57 (power scaling).
@@ -114,11 +115,13 @@ def _sensitivity(draws: np.ndarray, weights: list[np.ndarray] | None) -> float:
 
 
 def _remarks(draws: np.ndarray, compared: list[Any], prior: float, likelihood: float) -> list[str]:
-    prior_low, prior_high, *_ = compared
+    prior_low, prior_high, *_, verdict = compared
     median, remarks = float(np.median(draws)), []
     if median < prior_low or median > prior_high:
         remarks.append("outside the prior's 95%")
     if prior >= LIMITS.sensitive:
-        pulled = likelihood >= LIMITS.sensitive
-        remarks.append("priors and data may conflict" if pulled else "depends on the priors")
+        if likelihood >= LIMITS.sensitive:
+            remarks.append("priors and data may conflict")
+        elif verdict != "determined":
+            remarks.append("depends on the priors")
     return remarks

@@ -191,13 +191,13 @@ def signal_of(frames: Sequence[np.ndarray], level: float | None, detector: Detec
         raise CaptureError(what, where="saturation_level", hint=hint)
     if detector.read_noise >= 0.1 * full:
         what = f"it is {detector.read_noise:g}, and a pixel is full at {full:g}"
-        hint = "give read_noise and gain in the unit of the frames, such as 1/4095 for 12 bits"
+        hint = "give read_noise= and gain= in the unit of the frames, such as 1/4095 for 12 bits"
         raise CaptureError(what, where="read_noise", hint=hint)
     step = _count_step(frames)
     if step > 1 and full % step:
         bits = 16 - (step.bit_length() - 1)
         what = f"all counts are multiples of {step}: {bits} bits aligned to the left"
-        hint = f"give the full count as it stands in the file, saturation_level={65536 - step}"
+        hint = f"give the full count as it is in the file by saturation_level=, here {65536 - step}"
         raise CaptureError(what, where="saturation_level", hint=hint)
     transfer = as_transfer(detector.transfer)
     white = full if level is None else level

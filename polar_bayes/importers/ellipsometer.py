@@ -35,6 +35,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from polar_bayes.capture.plausibility import ASSUMED
 from polar_bayes.capture.schema import as_numbers, check_choice, validate
 from polar_bayes.errors import CaptureError
 from polar_bayes.importers.columns import Table, counted, read_table
@@ -125,6 +126,7 @@ def from_ellipsometer(
         source=Path(table).name,
         setup="goniometer",
         angle_set_by=angle_set_by,
+        **({"errors": ASSUMED} if any("was assumed" in note for note in notes) else {}),
         **({"import_notes": "; ".join(notes)} if notes else {}),
     )
     return validate(capture, source=capture.attrs["name"])
@@ -133,7 +135,7 @@ def from_ellipsometer(
 def _incidence(read: Table, values: Mapping[str, np.ndarray], angle_is: str | None) -> np.ndarray:
     """Return the angle of incidence of each line."""
     if "angle" not in values:
-        hint = "name its column, or give it in degrees"
+        hint = "give its column, or degrees, by angle="
         raise CaptureError("nothing gives the angle", where=f"{read.source}: angle", hint=hint)
     places = [f"{read.source}: line {line}" for line in read.lines]
     return as_incidence(np.broadcast_to(values["angle"], (len(places), 1))[:, 0], angle_is, places)

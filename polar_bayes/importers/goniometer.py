@@ -47,7 +47,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import nnls
 
-from polar_bayes.capture.plausibility import indices_by_eye
+from polar_bayes.capture.plausibility import ASSUMED, indices_by_eye
 from polar_bayes.capture.schema import POSITIVE, Interval, validate
 from polar_bayes.errors import CaptureError
 from polar_bayes.importers.columns import Table, counted, read_table
@@ -159,9 +159,16 @@ def _told(
     """Describe the treatment of the readings in attributes."""
     notes = dict.fromkeys(note for each in channels for note in each.notes)
     error: str | float = RELATIVE_ERROR if relative_error is None else float(relative_error)
+    origin: dict[str, str] = {}
     if relative_error is None and any(each.by_scatter for each in channels):
-        error = "scatter of the repeats"
+        error, origin = "scatter of the repeats", {"errors": "from the scatter of repeats"}
+    assumed = [each.name for each in channels if not each.stated.all()]
+    if relative_error is None and assumed:
+        origin = {"errors": ASSUMED}
+        what = f"an error of {RELATIVE_ERROR:.0%} of each reading of {' and '.join(assumed)}"
+        notes[f"{what} was assumed, which relative_error= replaces"] = None
     return {
+        **origin,
         "relative_error": error,
         "readings_at_zero": int(sum((each.light == 0.0).sum() for each in channels)),
         **({"import_notes": "; ".join(notes)} if notes else {}),
@@ -189,14 +196,14 @@ def _check_channels(asked: Mapping[str, Readings | None], given: Mapping[str, fl
     present = {key for key, readings in asked.items() if readings is not None}
     if not present or ("unpolarized" in present and len(present) > 1):
         what = "no channel is there" if not present else "unpolarized light is a channel alone"
-        hint = "give s and p, or one of s, p and unpolarized: a table or a pair (angles, readings)"
+        hint = "give s= and p=, or one of s=, p= and unpolarized= (a table or a pair of arrays)"
         raise CaptureError(what, where="goniometer", hint=hint)
     for key in given:
         if key.partition("_")[0] not in present:
-            hint = f"give {key.partition('_')[0]}, or leave it out"
+            hint = f"give {key.partition('_')[0]}=, or leave it out"
             raise CaptureError("its channel is missing", where=key, hint=hint)
     if {"s", "p"} <= present and ("s_incident" in given) != ("p_incident" in given):
-        hint = "give s_incident and p_incident, or neither"
+        hint = "give s_incident= and p_incident=, or neither"
         raise CaptureError("one incident level is missing", where="goniometer", hint=hint)
 
 
@@ -209,8 +216,8 @@ def _refuse_swapped(capture: xr.Dataset) -> None:
     if total >= 3 and below >= 0.9 * total:
         what = f"s lies below p at {below} of {total} angles, which no reflecting surface does"
         hint = (
-            "swap s and p, or give s_incident and p_incident where the channels differ in gain; a "
-            "coating that reflects more p light is imported by from_table, as q"
+            "swap s= and p=, or give s_incident= and p_incident= where the channels differ in "
+            "gain; a coating that reflects more p light is imported by pb.from_table, as q"
         )
         raise CaptureError(what, where=capture.attrs["name"], hint=hint)
 
@@ -389,14 +396,14 @@ class Channel:
                 what = f"of {self.name} at zero or below given the scatter of its neighbors"
                 notes = (*notes, counted(raised, "reading", what))
         what = f"the reading lies below the dark level {dark_level:g}"
-        hint = f"give the right dark_level, or the noise without light as {self.name}_error"
+        hint = f"give the right dark_level=, or the noise without light by {self.name}_error="
         self.refuse(light < -3.0 * errors / np.sqrt(self.count), what, hint)
         light = np.maximum(light, 0.0)
         full = 1.0
         if incident is not None:
             full = incident - dark_level
             what = "more light comes back than went in"
-            hint = f"check the incident levels: {self.name}_incident is {incident:g}"
+            hint = f"check {self.name}_incident=, which is {incident:g}"
             # Noise may carry a reflectance past one, not this far.
             self.refuse(light > 1.2 * full, what, hint)
         return dataclasses.replace(self, light=light / full, absolute=errors / full, notes=notes)
@@ -469,14 +476,14 @@ def _read(
     """Read the requested channels from one table, from a table each, or from arrays."""
     channels = {key: each for key, each in asked.items() if each is not None}
     if table is None and angle is not None:
-        hint = "give the table, or s and p as tables of their own"
+        hint = "give table=, or s= and p= as tables of their own"
         raise CaptureError("a column is named without table", where="angle", hint=hint)
     if table is None:
         return {key: _rows_of_own(key, each, sheet) for key, each in channels.items()}
     columns = {"angle": angle, **channels}
     for key, column in columns.items():
         if not isinstance(column, str):
-            hint = f"give {key}= the name of a column of the table"
+            hint = f"name a column of the table by {key}="
             raise CaptureError("its column is not named", where=f"{table}: {key}", hint=hint)
     named = [str(each) for each in columns.values()]
     read = read_table(table, named, sheet=sheet)

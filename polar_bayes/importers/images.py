@@ -75,7 +75,7 @@ class Binning:
         if min(self.shape) < 1:
             frames = f"frames of {self.frame[0]} rows and {self.frame[1]} columns"
             what = f"{frames} hold no square of {self.width} pixels"
-            raise CaptureError(what, where="bin, window", hint="give smaller ones")
+            raise CaptureError(what, where="bin= and window=", hint="give smaller ones")
 
     @property
     def width(self) -> int:
@@ -185,7 +185,7 @@ def _capture(
     if not valid.any():
         counts = ", ".join(f"{int(w.sum())} {r}" for r, w in reasons.items() if w.any())
         what = f"no reading is left ({counts})".replace("_", " ")
-        hint = "check shape, light and exposure, or average more pixels (bin)"
+        hint = "check shape, light and exposure, or average more pixels by bin="
         raise CaptureError(what, where=attributes["name"], hint=hint)
     readings = {
         "dop": np.clip(dop, 0.0, 1.0),  # noise alone may carry it past one; such bins are counted
@@ -208,6 +208,7 @@ def _capture(
     bright = stokes.intensity > 10.0 * np.sqrt(stokes.intensity_variance)
     described = attributes | {
         "setup": "picture",
+        "errors": "by the import's model of the sensor",
         "analyzer_angles": ", ".join(f"{angle:g}" for angle in angles),
         "bin": binning.bin,
         "window": binning.window,

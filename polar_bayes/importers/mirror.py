@@ -49,7 +49,7 @@ def as_incidence(
         first = int(np.argmax(wrong))
         scale = "" if angle_is is None else f", as {angle_is} an incidence of {found[first]:g}"
         what = f"the angle is outside {ZENITH} (angle {angle[first]:g}{scale})"
-        hint = _guess(angle, reading) if angle_is is None else "check angle_is"
+        hint = _guess(angle, reading) if angle_is is None else "check angle_is="
         raise CaptureError(what, where=places[first], hint=hint)
     return found
 

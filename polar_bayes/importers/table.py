@@ -149,10 +149,10 @@ def _columns(
         raise CaptureError("it holds elements of Mueller matrices", where=source, hint=hint)
     for column in (name for name in names if name not in (*columns.values(), *ignored)):
         where = f"{source}: column {column}"
-        _check_name(column, where)
+        _check_name(column, where, column)
         if column in used:
             what = f"{column} is the column {used[column]!r}, too"
-            raise CaptureError(what, where=where, hint="ignore one of both")
+            raise CaptureError(what, where=where, hint="leave one of both out by ignored=")
         used[column] = column
     return used
 
@@ -168,16 +168,27 @@ def _check_constants(
             raise CaptureError(f"{variable} is {value!r}", where=source, hint=hint)
         if variable in columns:
             what = f"{variable} is a constant and the column {columns[variable]!r}"
-            raise CaptureError(what, where=source, hint="give one of both, or ignore the column")
+            hint = "give one of both, or leave the column out by ignored="
+            raise CaptureError(what, where=source, hint=hint)
     for row in CONTRACT:
         if row.kind == "geometry" and row.name not in {*columns, *constants}:
-            hint = f"say which column it is, or give it as a constant: {row.hint}"
+            mirror = "; or name the column of a mirror's angle by angle=" * ("zenith" in row.name)
+            hint = (
+                f"name its column by columns={{'{row.name}': COLUMN}}, or the value of all lines "
+                f"by constants={{'{row.name}': NUMBER}} ({row.hint}){mirror}"
+            )
             raise CaptureError(f"nothing gives {row.name}", where=source, hint=hint)
 
 
-def _check_name(variable: str, where: str) -> None:
+def _check_name(variable: str, where: str, column: str = "") -> None:
     if near := nearest_name(variable, [*KNOWN, *DIMS]):
-        hint = f"say what it is (nearest: {near}), call it true_<name> or ignore it"
+        hint = f"name a variable (nearest: {near}), or call it true_<name>"
+        if column:
+            hint = (
+                f"say which variable it is by columns={{VARIABLE: '{column}'}} (nearest: {near}), "
+                f"leave it out by ignored=['{column}'], or import readings of s and p light by "
+                "pb.from_goniometer"
+            )
         raise CaptureError(f"a capture has no variable {variable!r}", where=where, hint=hint)
 
 
@@ -255,7 +266,7 @@ def _of_materials(
 ) -> xr.Dataset:
     leading = [dim for dim in DIMS if dim in values]
     if len(leading) > 1:
-        hint = "ignore one of both"
+        hint = "leave one of both out by ignored="
         raise CaptureError("it has materials and patches", where=source, hint=hint)
     if leading:
         labels = values.pop(leading[0])

@@ -216,7 +216,7 @@ NOTATION: dict[str, Quantity] = {
     "logit_scale": Quantity("", "noise of the log odds of dop"),
     "normal_scale": Quantity("", "noise of the readings"),
     "stokes_scale": Quantity("", "noise of q and u in full light"),
-    "stokes_error_factor": Quantity("", "true over stated errors of the Stokes parameters"),
+    "stokes_error_factor": Quantity("", "true errors of q and u over those in the capture"),
     "exposure": Quantity("", "recorded over predicted intensity"),
     "intensity_scale": Quantity("", "noise of the intensity"),
 }

@@ -14,6 +14,7 @@ from polar_bayes.benchmark.advice import accuracy_sentences, accuracy_view
 from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.alternatives import alternatives
 from polar_bayes.diagnostics.budget import (
+    DISCREPANCY,
     budget,
     budget_sentences,
     described,
@@ -93,11 +94,12 @@ def fit_page(result: xr.DataTree | FitView) -> page.Page:
     """Return the page of a fit."""
     fit = view_of(result)
     judged = convergence.verdict(fit)
+    answers: list[str] = []
     sentences: list[str] = []
     if judged.passed:
-        sentences = [*text.index_sentences(fit), text.trust(fit), text.next_sentence(fit.result)]
-        sentences += text.setup_beside_views(fit)
-        sentences += [*text.determined(fit), *text.between_members(fit)]
+        further = [text.next_sentence(fit.result), *text.setup_beside_views(fit)]
+        answers = [" ".join(text.index_sentences(fit)), text.trust(fit), " ".join(further)]
+        sentences = [*text.determined(fit), *text.between_members(fit)]
     approximation = "Convergence" if fit.method == "nuts" else "Approximation"
     code = str(fit.provenance.get("model_source") or "")
     source = [page.Details("Source of the model", code=code)] if code else []
@@ -132,6 +134,7 @@ def fit_page(result: xr.DataTree | FitView) -> page.Page:
         headline=text.fit_headline(fit),
         passed=judged.passed,
         problems=judged.problems,
+        answers=tuple(zip(text.QUESTIONS, answers, strict=False)),
         sentences=[*sentences, *text.notes(judged)],
         cautions=judged.cautions,
         beside=_glance(fit) if plots_curves.variables(fit) else None,
@@ -421,6 +424,7 @@ def budget_table(fit: FitView) -> Table:
     data = variance_shares(found).T
     descriptions = {"sd": "of the posterior", "perfect": "in a set-up that is known perfectly"}
     descriptions |= {"noise": "of the readings", "prior": "of the other parameters"}
+    descriptions[DISCREPANCY] = "smooth errors over angle of unknown shape"
     for quantity, u in found.attrs["known"].items():
         descriptions[quantity] = ", ± ".join(described(fit, quantity, u))
 
@@ -598,12 +602,12 @@ def _accuracy(result: xr.DataTree) -> Iterator[page.Block]:
 
 
 def provenance_facts(provenance: Provenance) -> list[page.Block]:
-    """Return the provenance in titled groups of names and values; swapped parts are marked."""
+    """Return the provenance in titled groups; what the user replaced is marked."""
     keys = ["method", "settings", "model", "scene", "scene_parts", "seed", "precision"]
     keys += ["chain_method", "step_size_halvings", "largest_view_zenith"]
     fit = {key.replace("_", " "): provenance[key] for key in keys if key in provenance}
     swapped = [str(name) for name in provenance.get("swapped") or ()]
-    fit["swapped by the user"] = swapped or "nothing: all defaults"
+    fit["replaced by the user"] = swapped or "nothing: all defaults"
     groups = {name: provenance.get(name) or {} for name in PROVENANCE_GROUPS}
     groups["priors"] = {n: short_numbers(str(x)) for n, x in groups["priors"].items()}
     if timings := groups["timings"]:
@@ -624,7 +628,7 @@ def provenance_facts(provenance: Provenance) -> list[page.Block]:
             values,
             PROVENANCE_GROUPS.get(name, "Fit"),
             marked=marked.get(name, ()),
-            mark="swapped",
+            mark="replaced",
         )
     ]
 

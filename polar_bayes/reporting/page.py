@@ -174,6 +174,7 @@ class Page:
     sections: Sequence[Section]
     footer: str
     problems: Sequence[str] = ()
+    answers: Sequence[tuple[str, str]] = ()
     sentences: Sequence[str] = ()
     cautions: Sequence[str] = ()
     beside: Picture | None = None

@@ -131,6 +131,9 @@ PLURALS = {"patch": "patches", "material": "materials"}
 
 HELD, PRIOR = " held fixed", "prior of "
 
+QUESTIONS = ("What is n?", "May I trust it?", "What should I measure next?")
+"""Questions that the first screen of a report answers, in the words of its guide."""
+
 
 def fit_headline(fit: FitView) -> str:
     """Return the verdict in one sentence."""
@@ -168,9 +171,11 @@ def swapped_sentence(provenance: Provenance) -> str:
     parts = [f"the {n}" for n in swapped if not n.startswith(PRIOR) and not n.endswith(HELD)]
     if priors:
         parts.append(f"the prior{'s' if len(priors) > 1 else ''} of {join_first(priors)}")
-    sentences = [f"Swapped by the user: {join(parts)}."] if parts else []
+    sentences = [f"Replaced by the user: {join(parts)}."] if parts else []
     sentences += [f"Held fixed: {join_first(held)}."] if held else []
-    return " ".join(sentences) or "Nothing was swapped: all parts and priors are as shipped."
+    return " ".join(sentences) or (
+        "No part of the model was replaced: scene, links and priors are the package's defaults."
+    )
 
 
 def determined(fit: FitView) -> list[str]:
@@ -311,6 +316,10 @@ def index_sentences(fit: FitView) -> list[str]:
     return [f"The refractive index n is {join(phrases)}."]
 
 
+SMALL_GAIN = 0.1
+"""Share by which further views narrow an interval, below which they hardly help."""
+
+
 def next_sentence(result: xr.DataTree) -> str:
     """State what to measure next, if the result holds `polar_bayes.next_views`."""
     if "next_views" not in result.children:
@@ -319,19 +328,24 @@ def next_sentence(result: xr.DataTree) -> str:
             "result['next_views'] = pb.next_views(result)."
         )
     found = result["next_views"].to_dataset()
-    views = verdict(found).sentences[0].rstrip(".").replace("Look next", "Measure next")
+    first, *others = verdict(found).sentences
+    views = first.rstrip(".").replace("Look next", "Measure next")
+    limits = "".join(f" {each}" for each in others if each.startswith("Candidates"))
     widths = found["interval_width"].transpose("step", "parameter").to_pandas()
     of_index = widths.filter(like="refractive_index")
     before, after = (of_index if of_index.size else widths).iloc[[0, -1]].to_numpy()
     of = " of n" if of_index.size else ""
+    share = 1.0 - after / before
+    if share.max() < SMALL_GAIN:
+        return f"{views}: but 95% intervals{of} narrow by {percent(share.max())} at most.{limits}"
     if len(before) == 1:
         return (
             f"{views}: the 95% interval{of} is expected to narrow from {before[0]:.3g} to "
-            f"{after[0]:.3g}."
+            f"{after[0]:.3g}.{limits}"
         )
-    least, most = (f"{end(1.0 - after / before):.0%}" for end in (np.min, np.max))
+    least, most = (f"{end(share):.0%}" for end in (np.min, np.max))
     by = least if least == most else f"{least} to {most}"
-    return f"{views}: the 95% intervals{of} are expected to narrow by {by}."
+    return f"{views}: the 95% intervals{of} are expected to narrow by {by}.{limits}"
 
 
 def setup_beside_views(fit: FitView) -> list[str]:

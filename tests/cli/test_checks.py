@@ -49,6 +49,7 @@ def test_calibrate_prints_a_table_and_writes_every_fit(plate, plate_scene, tmp_p
 
 def test_identify_says_what_is_told_and_where_to_look(plate, plate_scene, capsys) -> None:
     words = ["identify", str(plate), "--next-views", "2", "--scene", plate_scene]
+    words += ["--from-light", "40"]
     assert main([*words, "--criterion", "refractive_index", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert 0.0 < told["parameters"]["refractive_index"]["prior_share"] < 0.5
@@ -56,6 +57,9 @@ def test_identify_says_what_is_told_and_where_to_look(plate, plate_scene, capsys
     widths = told["next views"]["refractive_index"]
     assert widths["after 2"] < widths["after 1"] < widths["now"]
     assert told["next views: sentences"][0].startswith("Look next at zenith ")
+    assert told["next views: sentences"][-1].startswith("Candidates had zeniths from ")
+    assert "at least 40 degrees from the light" in told["next views: sentences"][-1]
+    assert told["next views: sentences"][-1].endswith("polar-bayes identify --from-light 30.")
     assert main([*words, "--criterion", "bend"]) == 1
     assert capsys.readouterr().err.splitlines() == [
         "SingleParameter('bend'): no parameter of the material has that name; "

@@ -15,7 +15,7 @@ from synthetic_results import edit_provenance, make_result, replace
 import polar_bayes as pb
 from polar_bayes.cli import main
 from polar_bayes.cli.entry import commands
-from polar_bayes.cli.wording import FUNCTIONS, KEYWORDS, as_commands
+from polar_bayes.cli.wording import FUNCTIONS, KEYWORDS, OF_IMPORTS, as_commands
 
 ROOT = Path(__file__).parents[2]
 
@@ -72,6 +72,64 @@ def test_no_sentence_of_the_package_keeps_its_python_form() -> None:
         if " " in text and not VALUES.fullmatch(text) and not OUT_OF_REACH.search(text)
     ]
     assert not left
+
+
+def test_no_sentence_of_an_import_keeps_an_argument_of_python() -> None:
+    names = [f"{name}(?!=)" for name in OF_IMPORTS if "_" in name]
+    argument = re.compile(
+        rf"(?<!attribute )\b(?:{'|'.join(names)})\b|\b(?:{'|'.join(OF_IMPORTS)})="
+    )
+    left = [
+        f"{path.name}: {said}"
+        for path in (ROOT / "polar_bayes" / "importers").rglob("*.py")
+        for text in _texts(ast.parse(path.read_text()))
+        if " " in text and re.search(argument, said := as_commands(text))
+    ]
+    assert not left
+
+
+READINGS = "angle;perp;parallel\n20;47;36\n30;51;33\n40;58;27\n"
+
+
+@each(
+    ("words", "hints"),
+    [
+        (["table", "{}"], ["--column VARIABLE angle", "--ignore angle", "import goniometer"]),
+        (
+            ["table", "{}", "--column", "intensity", "perp", "--ignore", "angle",
+             "--ignore", "parallel"],
+            ["--column view_zenith COLUMN", "--constant view_zenith NUMBER", "by --angle"],
+        ),
+        (["table", "{}", "--angle", "angle", "--angle-set-by", "eye"], ["--angle-set-by eye: "]),
+        (["goniometer", "--angle-set-by", "stage"], ["give --s and --p, or one of --s,"]),
+        (["goniometer", "--table", "{}", "--s", "perp", "--p", "parallel"], ["by --angle"]),
+        (
+            ["goniometer", "--table", "{}", "--angle", "angle", "--s", "parallel", "--p", "perp"],
+            ["swap --s and --p, or give --s-incident and --p-incident"],
+        ),
+        (
+            ["goniometer", "--table", "{}", "--angle", "angle", "--s", "perp", "--p", "parallel",
+             "--s-incident", "40"],
+            ["--s-incident and --p-incident, or neither"],
+        ),
+        (
+            ["goniometer", "--table", "{}", "--angle", "angle", "--s", "perp", "--dark-level",
+             "60"],
+            ["the right --dark-level, or the noise without light by --s-error"],
+        ),
+        (["ellipsometer", "--table", "{}", "--psi", "perp"], ["or degrees, by --angle"]),
+    ],
+)  # fmt: skip
+def test_a_refused_import_names_options(
+    words: list[str], hints: list[str], tmp_path: Path, capsys
+) -> None:
+    table = tmp_path / "plate.csv"
+    table.write_text(READINGS)
+    out = ["--out", str(tmp_path / "plate.nc")]
+    assert main(["import", *(word.format(table) for word in words), *out]) == 1
+    said = capsys.readouterr().err
+    assert all(hint in said for hint in hints), said
+    assert not PYTHON.findall(said)
 
 
 def _texts(tree: ast.AST) -> Iterator[str]:

@@ -156,6 +156,10 @@ def test_the_choice_is_said_in_words() -> None:
         "Look next at zenith 10, azimuth 180; then at zenith 80, azimuth 180."
     )
     assert list(pb.summary(found)) == ["now", "after 1", "after 2"]
+    (limits,) = pb.verdict(found).sentences[-1:]
+    assert limits.startswith("Candidates had zeniths from 10 to 80 degrees, however near to the l")
+    apart = on_a_line(count=2, constraints=pb.design.Constraints(from_light=20.0))
+    assert "at least 20 degrees from the light" in pb.verdict(apart).sentences[-1]
 
 
 @each(

@@ -2,13 +2,15 @@
 
 import numpy as np
 import numpyro
+import pandas as pd
 import pytest
 import xarray as xr
 from cases import each
 from plates import LINKS, PLATE, plate_capture
+from synthetic_results import edit_provenance, make_result
 
 import polar_bayes as pb
-from polar_bayes.diagnostics.budget import better_known, budget_sentences, variance_shares
+from polar_bayes.diagnostics.budget import _row, better_known, budget_sentences, variance_shares
 from polar_bayes.diagnostics.view import view_of
 from polar_bayes.inference.request import resolve
 from polar_bayes.physics.input_quantities import (
@@ -95,6 +97,32 @@ def test_contributions_add_in_squares(fit: xr.DataTree) -> None:
     assert table.attrs["known"] == KNOWN
 
 
+def test_each_factor_of_a_normal_posterior_contributes_its_precision() -> None:
+    """One parameter, two input quantities and three weights of a smooth error."""
+    rng, stated = np.random.default_rng(3), pd.Series({"angle_zero": 0.75, "leakage": 0.01})
+    own = np.diag(np.array([0.4, *stated, 1.0, 1.0, 1.0]) ** -2.0)
+    noise = rng.normal(size=(8, 6)) * [10.0, 2.0, 300.0, 1.0, 1.0, 1.0]
+    noise = noise.T @ noise
+    joint = np.linalg.inv(noise + own)
+    parts, by_noise = joint[0] ** 2 * np.diag(own), joint[0] @ noise @ joint[0]
+    found = _row(joint, by_noise / (by_noise + parts[0]), stated, stated)
+    rest = [0, 3, 4, 5]
+    perfect = np.linalg.inv((noise + own)[np.ix_(rest, rest)])[0, 0]
+    expected = [joint[0, 0], perfect, by_noise, parts[0], parts[3:].sum(), *parts[1:3]]
+    np.testing.assert_allclose(np.square(found), expected, rtol=1e-6)
+
+
+def test_a_discrepancy_has_a_column_of_its_own() -> None:
+    result = make_result(wavelengths=(), views=12, draws=300, variables=("dop",), discrepancy=True)
+    posterior = result["posterior"].to_dataset()
+    weight = posterior["discrepancy_weights"][..., 0]
+    posterior["roughness"] = 0.2 + 0.03 * weight + 1e-4 * posterior["roughness"]
+    result["posterior"] = posterior.assign(angle_zero=posterior["absorption"])
+    table = pb.budget(edit_provenance(result, known={"angle_zero": 0.75}))
+    assert list(table)[2:] == ["noise", "prior", "model discrepancy", "angle_zero"]
+    assert table.loc["roughness", "model discrepancy"] == pytest.approx(0.03, rel=0.2)
+
+
 def test_it_is_kept_in_a_file_and_the_verdict_names_what_to_know_better(fit, tmp_path) -> None:
     pb.save(fit, tmp_path / "fit.nc")
     loaded = pb.load(tmp_path / "fit.nc")
@@ -102,7 +130,7 @@ def test_it_is_kept_in_a_file_and_the_verdict_names_what_to_know_better(fit, tmp
     (sentence,) = budget_sentences(loaded)
     assert sentence in pb.verdict(loaded).findings
     assert sentence.startswith(
-        "What the set-up is known to makes standard uncertainties larger than"
+        "The uncertainty of the set-up makes standard uncertainties larger than"
     )
     what, sd = better_known(view_of(fit), "refractive_index")
     assert what == "exponent of the sensor's tone curve known to 0.01 instead of 0.02"

@@ -253,6 +253,9 @@ def test_errors_stated_too_large_or_too_small_have_their_own_sentence(factor, le
     row = criticize(tree).loc["noise"]
     assert row["level"] == level
     assert words in row["sentence"]
+    assumed = edit_provenance(tree, capture={"errors": "assumed by the import"})
+    words = words.replace("their stated errors", "the errors that were assumed by the import")
+    assert words in criticize(assumed).loc["noise", "sentence"]
 
 
 # --- Systematic errors ----------------------------------------------------------------------------

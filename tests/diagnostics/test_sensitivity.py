@@ -9,7 +9,7 @@ from scipy import stats
 from synthetic_results import PRIOR, make_result, replace
 
 from polar_bayes.diagnostics.compare import compare_without
-from polar_bayes.diagnostics.sensitivity import sensitivity
+from polar_bayes.diagnostics.sensitivity import _remarks, sensitivity
 
 
 def test_widths_are_those_of_normal_distributions() -> None:
@@ -52,6 +52,19 @@ def test_the_verdict_is_the_same_for_a_parameter_and_its_logarithm(scale) -> Non
     plain = with_prior_and_posterior(prior, posterior).loc["exposure"]
     assert row["prior_inside"] == pytest.approx(plain["prior_inside"], abs=0.01)
     assert row["verdict"] == plain["verdict"] == "determined"
+
+
+@each(
+    ("verdict", "likelihood", "said"),
+    [
+        ("not determined", 0.01, ["depends on the priors"]),
+        ("determined", 0.01, []),
+        ("determined", 0.1, ["priors and data may conflict"]),
+    ],
+)
+def test_no_remark_contradicts_that_data_determine_a_parameter(verdict, likelihood, said) -> None:
+    compared = [-2.0, 2.0, -0.2, 0.2, 0.1, 0.1, 0.99, verdict]
+    assert _remarks(np.zeros(3), compared, 0.1, likelihood) == said
 
 
 def test_a_posterior_in_the_tail_of_its_prior_is_not_the_prior() -> None:

@@ -159,7 +159,7 @@ def test_mueller_elements_give_q_of_either_sign_convention(write, kind):
 REFUSED = [
     ({"angle": "a", "psi": "P", "unit": "gon"}, "unit: it is 'gon'; give degree or radian"),
     ({"angle": "a", "mueller": "m"}, "mueller: it is 'm'; give column or row"),
-    ({"psi": "P"}, "angle: nothing gives the angle; name its column"),
+    ({"psi": "P"}, "angle: nothing gives the angle; give its column"),
     ({"angle": "a", "mueller": "row"}, "no column is an element of a matrix; name them m00"),
     ({"angle": "a", "psi": "x"}, "there is no column 'x'; choose from a, P, D"),
     ({"angle": "a", "psi": "D"}, "line 2: psi is 180, outside 0 to 90 degrees; check the column"),

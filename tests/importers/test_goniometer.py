@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 from cases import each
 
+from polar_bayes.capture import inferred, stated
 from polar_bayes.capture.files import load_capture, save_capture
 from polar_bayes.capture.schema import count, validate
 from polar_bayes.errors import CaptureError
@@ -68,7 +69,7 @@ def swapped(tmp_path, form):
 def test_swapped_s_and_p_are_refused(tmp_path, form):
     with pytest.raises(CaptureError, match="plate: s lies below p at 13 of 13 angles") as caught:
         swapped(tmp_path, form)
-    assert "swap s and p, or give s_incident and p_incident" in str(caught.value)
+    assert "swap s= and p=, or give s_incident= and p_incident=" in str(caught.value)
 
 
 @each("ratio", [0.5, 1.0, 2.0])
@@ -107,6 +108,30 @@ def test_attributes_tell_how_it_was_measured(tmp_path):
     assert capture.attrs == expected | options
     save_capture(capture, tmp_path / "plate.nc")
     xr.testing.assert_identical(load_capture(tmp_path / "plate.nc"), capture)
+
+
+@each(
+    ("asked", "said"),
+    [
+        ({}, "errors assumed by the import"),
+        ({"s_error": 0.5, "p_error": 0.5}, "errors assumed by the import"),
+        ({"relative_error": 0.01}, "errors stated"),
+    ],
+)
+def test_errors_that_nobody_stated_are_said_to_be_assumed(asked, said):
+    capture = from_goniometer(*readings(), **asked)
+    assert f"q ({said})" in inferred(capture)[0]
+    (note, *_) = stated(capture)
+    assert ("1% of each reading of s and p was assumed" in note) == ("assumed" in said)
+
+
+def test_errors_from_repeats_or_cells_are_not_assumed(tmp_path):
+    s, p = ((np.repeat(x, 2), np.repeat(y, 2) + [0.0, 0.01] * x.size) for x, y in readings())
+    assert "q (errors from the scatter of repeats)" in inferred(from_goniometer(s, p))[0]
+    table = tmp_path / "plate.csv"
+    table.write_text("angle,s,p\n40,10.0(1),5.0(1)\n50,20.0(1),1.2(1)\n")
+    capture = from_goniometer(table=table, angle="angle", s="s", p="p")
+    assert "q (errors stated)" in inferred(capture)[0]
 
 
 def test_errors_follow_from_the_channels_by_monte_carlo():
@@ -265,14 +290,18 @@ def test_a_reading_of_zero_is_as_uncertain_as_its_neighbors_scatter():
 
 GOOD = ([40.0, 50.0], [2.0, 3.0])
 OPTIONS = [
-    ({}, "goniometer: no channel is there", "give s and p, or one of s, p and unpolarized"),
-    ({"s": GOOD, "unpolarized": GOOD}, "unpolarized light is a channel alone", "give s and p, or"),
-    ({"s": GOOD, "p_error": 1.0}, "p_error: its channel is missing", "give p, or leave it out"),
+    ({}, "goniometer: no channel is there", "give s= and p=, or one of s="),
+    (
+        {"s": GOOD, "unpolarized": GOOD},
+        "unpolarized light is a channel alone",
+        "give s= and p=, or",
+    ),
+    ({"s": GOOD, "p_error": 1.0}, "p_error: its channel is missing", "give p=, or leave it out"),
     ({"s": GOOD, "angle_is": "theta"}, "angle_is: it is 'theta'", "give one of incidence, from-s"),
-    ({"s": GOOD, "p": GOOD, "angle": "a"}, "angle: a column is named without table", "give the ta"),
-    ({"table": "t.csv", "s": "S", "p": "P"}, "t.csv: angle: its column is not named", "angle= the"),
-    ({"table": "t.csv", "angle": "a", "s": GOOD, "p": "P"}, "t.csv: s: its column", "give s= the"),
-    ({"table": "t.csv", "angle": "a", "p": GOOD}, "t.csv: p: its column is", "give p= the name"),
+    ({"s": GOOD, "p": GOOD, "angle": "a"}, "angle: a column is named without table", "give table="),
+    ({"table": "t.csv", "s": "S", "p": "P"}, "t.csv: angle: its column is not named", "by angle="),
+    ({"table": "t.csv", "angle": "a", "s": GOOD, "p": "P"}, "t.csv: s: its column", "table by s="),
+    ({"table": "t.csv", "angle": "a", "p": GOOD}, "t.csv: p: its column is", "table by p="),
     ({"table": "t.csv", "angle": "a", "s": "S", "p": "P"}, "t.csv: there is no such", "check the"),
     ({"s": "gone.txt", "p": GOOD}, "gone.txt: there is no such file", "check the path"),
     ({"s": GOOD, "p": GOOD, "s_incident": 9.0}, "one incident level is missing", "or neither"),
@@ -302,11 +331,11 @@ OPTIONS = [
         "check angle_is",
     ),
     ({"s": ([40, 50], [1, 1e31]), "p": GOOD}, "s[row=1]: the reading is too large", "below 1e+30"),
-    ({"s": ([40, 50], [1, -9]), "p": GOOD}, "s[row=1]: the reading lies below the", "as s_err"),
+    ({"s": ([40, 50], [1, -9]), "p": GOOD}, "s[row=1]: the reading lies below the", "by s_err"),
     (
         {"s": GOOD, "p": GOOD, "s_incident": 2.4, "p_incident": 9.0},
         "s[row=1]: more light comes back than went in (angle 50, s 3)",
-        "check the incident levels: s_incident is 2.4",
+        "check s_incident=, which is 2.4",
     ),
     ({"s": GOOD, "p": ([10, 20], [1, 2])}, "s and p share no angle", "over the same range"),
 ]

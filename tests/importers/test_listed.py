@@ -125,7 +125,7 @@ def test_the_order_of_lines_changes_nothing(tmp_path_factory, data):
 
 
 REFUSED = [
-    (PLAIN, {}, "nothing gives view_azimuth", "give it as a constant: give degrees around"),
+    (PLAIN, {}, "nothing gives view_azimuth", "constants={'view_azimuth': NUMBER} (give deg"),
     (PLAIN, {"columns": {"u": "v"}}, "there is no column 'v'", "view_zenith, dop, intensity"),
     (PLAIN, {"ignored": ["time"]}, "there is no column 'time'", "choose from"),
     (PLAIN, {"columns": {"dopp": "dop"}}, "no variable 'dopp'", "nearest: dop"),
@@ -140,16 +140,21 @@ REFUSED = [
         "patch,material,view_zenith,dop\n1,1,10,.1\n",
         {"constants": ANGLES},
         "it has materials and patches",
-        "ignore one of both",
+        "leave one of both out by ignored=",
     ),
     (PLAIN, {"constants": {"dop": 0.1}}, "dop is a constant and the column 'dop'", "one of both"),
     (
         PLAIN,
         {"columns": {"dop": "intensity"}},
         "dop is the column 'intensity', too",
-        "ignore one of",
+        "leave one of",
     ),
-    ("view_zenith,DoLP\n10,.1\n", {}, "column DoLP: a capture has no variable", "say what it is"),
+    (
+        "view_zenith,DoLP\n10,.1\n",
+        {},
+        "column DoLP: a capture has no variable",
+        "say which",
+    ),
     (
         "view_zenith,dop\n# x\n10,.1\n20,12\n",
         {"constants": ANGLES},

@@ -247,7 +247,7 @@ def test_bits_aligned_to_the_left_are_read_at_their_own_full_count():
     plain = from_mosaic(raw, detector=pb.importers.Detector(saturation_level=4095.0), **known)
     left = (16.0 * raw).astype(np.uint16)
     for level in (4095.0, 65535.0):
-        with pytest.raises(CaptureError, match=r"multiples of 16: 12 bits .*level=65520"):
+        with pytest.raises(CaptureError, match=r"multiples of 16: 12 bits .*level=, here 65520"):
             from_mosaic(left, detector=pb.importers.Detector(saturation_level=level), **known)
     scaled = pb.importers.Detector(saturation_level=16.0 * 4095.0, read_noise=16.0)
     found = from_mosaic(left, detector=scaled, **known)

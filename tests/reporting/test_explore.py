@@ -1,5 +1,6 @@
 """A map that one can point at: what its page holds, and what a real pointer is shown."""
 
+import json
 import re
 import sys
 import time
@@ -22,6 +23,7 @@ from textbook import plate_q
 import polar_bayes as pb
 from polar_bayes.inference.batching import Status
 from polar_bayes.inference.request import resolve
+from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.maps.lazy import map_parameters
 from polar_bayes.models.sites import SPECTRAL
 from polar_bayes.observation.data import ANGLES, READINGS
@@ -137,6 +139,28 @@ def test_fitted_values_are_those_of_a_textbook_at_the_posterior_means(monkeypatc
         decoded(arrays["angles"], about["zenith"]["scale"]), VIEWS, atol=0.01
     )
     assert about["is_joined"]
+
+
+@pytest.mark.usefixtures("compiled_in_haste")
+def test_a_map_in_a_store_is_predicted_with_what_its_pixels_share(tmp_path: Path) -> None:
+    maps, capture = plates()
+    quantiles = {"0.025": 0.9, "0.5": 1.0, "0.975": 1.1}
+    shared = {"quantiles": quantiles, "pixels": 53, "disagreement": 0.1}
+    about = provenance_of(maps) | {"shared": {"stokes_error_factor": shared}}
+    own = [name for name in maps if not name.startswith("stokes_error_factor")]
+    maps = maps[own].assign_attrs({PROVENANCE: json.dumps(about)})
+    maps.chunk(y=3, x=5).to_zarr(tmp_path / "maps.zarr", consolidated=False)
+    stored = pb.maps.open_map(tmp_path / "maps.zarr")
+    assert list(pb.maps.shared_parameters(stored).index) == ["stokes_error_factor"]
+    assert {x.name for x in shown_parameters(stored)} == {"refractive_index", "subsurface_fraction"}
+    about, arrays, _ = map_readings(stored, capture)
+    assert about["panels"][0]["kinds"] == 2
+    fitted = decoded(arrays["readings"][0][1], about["panels"][0]["scale"])
+    means = (maps[n].to_numpy()[..., None] for n in ("refractive_index", "subsurface_fraction"))
+    expected = plate_q(*means, np.radians(VIEWS)).ravel()
+    known = np.isfinite(expected)
+    np.testing.assert_allclose(fitted[known], expected[known], rtol=0.0, atol=1e-4)
+    assert "refractive index n" in pb.explore(stored).html
 
 
 def test_each_pixel_may_have_directions_of_its_own() -> None:

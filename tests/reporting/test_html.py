@@ -19,9 +19,10 @@ from polar_bayes.diagnostics.convergence import Verdict, summary, verdict
 from polar_bayes.diagnostics.criticism import criticize
 from polar_bayes.diagnostics.view import FitView, view_of
 from polar_bayes.errors import PolarBayesError
+from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.reporting import fit_page
 from polar_bayes.reporting.report import render, report
-from polar_bayes.reporting.text import interval, join, numbers, overconfidence, percent
+from polar_bayes.reporting.text import QUESTIONS, interval, join, numbers, overconfidence, percent
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -134,7 +135,12 @@ def test_the_first_screen_tells_the_index_the_trust_and_the_next_views(small) ->
     first = page.text.partition("parameter mean sd")[0]
     row = summary(result).loc["refractive_index"]
     assert f"The refractive index n is {numbers([row['mean']], row['sd'])[0]} (95% int" in first
-    assert first.index("The refractive index n is") < first.index("Nothing speaks against")
+    for question, answer in zip(
+        QUESTIONS,
+        ("The refractive index n is", "Nothing speaks against", "What to measure next is not"),
+        strict=True,
+    ):
+        assert f"{question} {answer}" in first
     assert "What to measure next is not worked out here" in first
     told = result.copy()
     told["next_views"] = xr.Dataset(
@@ -149,8 +155,24 @@ def test_the_first_screen_tells_the_index_the_trust_and_the_next_views(small) ->
         "Measure next at zenith 70, azimuth 180: the 95% interval of n is expected to narrow from "
         "0.4 to 0.1."
     ) in Page(render(told)).text
-    told["next_views"] = told["next_views"].to_dataset().assign_coords(parameter=["a", "b"])
+    views = told["next_views"].to_dataset()
+    told["next_views"] = views.assign(
+        interval_width=views["interval_width"][[0, 0]] * [[1.0], [0.99]]
+    )
+    assert "180: but 95% intervals of n narrow by 1.0% at most." in Page(render(told)).text
+    told["next_views"] = views.assign_coords(parameter=["a", "b"])
     assert "the 95% intervals are expected to narrow by 0% to 75%." in Page(render(told)).text
+    told["next_views"] = views.assign_attrs({PROVENANCE: '{"limits": [5.0, 75.0, 20.0]}'})
+    assert (
+        "from 0.4 to 0.1. Candidates had zeniths from 5 to 75 degrees, at least 20 degrees from "
+        "the light; where light and viewer would collide, state their smallest angle by "
+        "constraints=pb.design.Constraints(from_light=30), or polar-bayes identify --from-light 30."
+    ) in Page(render(told)).text
+
+
+def test_the_guide_asks_the_questions_of_the_first_screen() -> None:
+    guide = (Path(__file__).parents[2] / "docs" / "reading_a_report.md").read_text()
+    assert all(f"**{question}**" in guide for question in QUESTIONS)
 
 
 @pytest.mark.thorough

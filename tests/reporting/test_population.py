@@ -124,16 +124,21 @@ def test_tables_have_a_cell_for_every_head() -> None:
 @each(
     ("swapped", "said"),
     [
-        ([], "Nothing was swapped: all parts and priors are as shipped."),
-        (["scene"], "Swapped by the user: the scene."),
+        (
+            [],
+            "No part of the model was replaced: scene, links and priors are the package's "
+            "defaults.",
+        ),
+        (["scene"], "Replaced by the user: the scene."),
         (
             ["scene", "model", "prior of roughness", "prior of absorption"],
-            "Swapped by the user: the scene, the model and the priors of roughness and absorption.",
+            "Replaced by the user: the scene, the model and the priors of roughness and "
+            "absorption.",
         ),
         (["refractive_index held fixed"], "Held fixed: refractive_index."),
         (
             ["links", *(f"prior of p{i}" for i in range(8))],
-            "Swapped by the user: the links and the priors of p0, p1, p2, p3, p4, p5 and 2 more.",
+            "Replaced by the user: the links and the priors of p0, p1, p2, p3, p4, p5 and 2 more.",
         ),
     ],
 )
@@ -158,7 +163,7 @@ def test_provenance_marks_what_was_swapped() -> None:
         "swapped": ["model", "prior of roughness", "refractive_index held fixed"],
     }
     groups = {facts.title: facts.rows for facts in provenance_facts(provenance)}
-    marked = {name for rows in groups.values() for name, _, mark in rows if mark == "swapped"}
+    marked = {name for rows in groups.values() for name, _, mark in rows if mark == "replaced"}
     assert marked == {"model", "roughness"}
     assert groups["Priors that stand in the model itself"] == (("tilt", "Normal", ""),)
     assert groups["Held fixed, by the model or around it"] == (("refractive_index", "1.45", ""),)
