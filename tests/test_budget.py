@@ -17,22 +17,22 @@ CODE = {
     "design": 1086,
     "diagnostics": 1788,
     "importers": 2111,
-    "inference": 2692,
-    "maps": 1704,
+    "inference": 2694,
+    "maps": 1714,
     "methods": 1226,
     "numerics": 992,
     "observation": 499,
     "physics": 2650,
-    "reporting": 3311,
+    "reporting": 3312,
     "scenes": 1756,
     "own files": 1568,
     "models": 320,
-    "tests": 23880,
+    "tests": 23886,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25372,
+    "code": 25385,
     "classes": 335,
     "constants": 418,
     "Any": 194,

@@ -56,6 +56,8 @@ class Request(ModelParts):
     precision: str
     shared: tuple[str, ...]
     """Parameters of the set-up that the pixels of an image share by default."""
+    perfect: tuple[str, ...]
+    """Input quantities of the set-up that count as known perfectly."""
 
     def describe(self) -> Provenance:
         """Describe the request in types of JSON, for the provenance of a result."""
@@ -100,8 +102,8 @@ def resolve(
         scene = str(capture.attrs.get("setup", "polarimeter"))
     setup, scene_name = _find_scene(scene, capture)
     setup = as_read(setup, capture)
+    acting = [each for each in setup.known if all(name in capture for name in each.needs)]
     if not is_perfect:
-        acting = (each for each in setup.known if all(name in capture for name in each.needs))
         setup = dataclasses.replace(setup, scene=setup.scene.known_to(acting))
     chosen = _choose_links(capture, setup, links)
     limit = setup.largest_view_zenith if largest_view_zenith is None else largest_view_zenith
@@ -146,6 +148,7 @@ def resolve(
         seed=int(seed),
         precision=precision,
         shared=tuple(name for name in setup.shared if name in found.priors),
+        perfect=tuple(each.name for each in acting) if is_perfect else (),
     )
 
 

@@ -346,6 +346,7 @@ def provenance_json(plan: MapPlan) -> str:
         "intensity_unit": plan.intensity_unit,
         "shared": {each.name: _described(each, request) for each in plan.shared},
         "shared_by_default": plan.shares_by_default,
+        "perfect": list(request.perfect),
         **plan.found,
     }
     return json.dumps(provenance, sort_keys=True)

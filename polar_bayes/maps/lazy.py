@@ -359,6 +359,18 @@ def shared_cautions(maps: xr.Dataset) -> list[str]:
     ]
 
 
+def setup_cautions(maps: xr.Dataset) -> list[str]:
+    """Caution that no interval of a pixel holds what the set-up is known to."""
+    perfect = provenance_of(maps).get("perfect")
+    if not perfect:
+        return []
+    return [
+        f"Each pixel takes the set-up for perfectly known: {', '.join(perfect)}. Errors of these "
+        "move all pixels alike, and no interval of a pixel holds them. The fit of the mean of a "
+        "region has them among its parameters."
+    ]
+
+
 def map_parameters(maps: xr.Dataset) -> list[str]:
     """Return names of the parameters that have a map."""
     return [str(name) for name in maps.data_vars if f"{name}_quantile" in maps]
