@@ -12,18 +12,18 @@ ROOT = Path(__file__).parents[1]
 CODE = {
     "benchmark": 574,
     "calibration": 1037,
-    "capture": 807,
+    "capture": 813,
     "cli": 1251,
-    "design": 1086,
+    "design": 1085,
     "diagnostics": 1788,
-    "importers": 2111,
-    "inference": 2694,
+    "importers": 2108,
+    "inference": 2695,
     "maps": 1714,
     "methods": 1226,
     "numerics": 992,
     "observation": 499,
     "physics": 2650,
-    "reporting": 3312,
+    "reporting": 3311,
     "scenes": 1756,
     "own files": 1568,
     "models": 320,
@@ -32,9 +32,9 @@ CODE = {
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25385,
+    "code": 25387,
     "classes": 335,
-    "constants": 418,
+    "constants": 417,
     "Any": 194,
     "longest function": 80,
 }

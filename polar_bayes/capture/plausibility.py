@@ -49,6 +49,16 @@ class IndexByEye(NamedTuple):
         return math.degrees(math.atan(self.center))
 
     @property
+    def below_vacuum(self) -> str:
+        """What speaks against the angles, which may be those from the surface; or an empty text."""
+        if self.high >= 1.0:
+            return ""
+        return (
+            f"is largest near {self.angle:.0f} degrees, which would be Brewster's angle of an "
+            f"index of {self.center:.2f}, below that of vacuum"
+        )
+
+    @property
     def is_pure(self) -> bool:
         """True if the surface alone makes the peak."""
         return self.polarization >= PURE_PEAK
@@ -356,12 +366,10 @@ def _side_cautions(name: str, capture: xr.Dataset) -> Iterator[str]:
 def _scale_cautions(name: str, capture: xr.Dataset) -> Iterator[str]:
     """Caution against a Brewster angle below that of vacuum: angles from the surface?"""
     peak = _brewster(capture)
-    if peak is not None and peak.high < 1.0:
+    if peak is not None and peak.below_vacuum:
         yield (
-            f"The polarization{name} is largest near {peak.angle:.0f} degrees, which would be "
-            f"Brewster's angle of an index of {peak.center:.2f}, below that of vacuum: the angles "
-            "were likely counted from the surface, which an import takes by "
-            "angle_is='from-surface'."
+            f"The polarization{name} {peak.below_vacuum}: the angles were likely counted from the "
+            "surface, which an import takes by angle_is='from-surface'."
         )
 
 

@@ -222,7 +222,7 @@ def map_(
         click.echo(f"{name}: {interval} in all pixels, from {row['pixels']:.0f} of them")
     for sentence in (*pb.maps.criticism_sentences(maps), *pb.maps.start_sentences(maps)):
         say(sentence)
-    print_cautions([*pb.maps.shared_cautions(maps), *pb.maps.setup_cautions(maps)])
+    print_cautions([*pb.maps.shared_cautions(maps), *pb.maps.perfect_cautions(maps)])
 
 
 @command()

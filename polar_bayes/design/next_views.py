@@ -37,7 +37,6 @@ from polar_bayes.design.optimal_design import (
     fedorov_exchange,
 )
 from polar_bayes.design.setup import (
-    PRIOR_DRAWS,
     DesignProblem,
     coordinate_indices,
     make_design_problem,
@@ -48,7 +47,7 @@ from polar_bayes.design.setup import (
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compiled_model import compile_model
 from polar_bayes.inference.problem import observe_request
-from polar_bayes.inference.program import from_prior
+from polar_bayes.inference.program import PRIOR_DRAWS, from_prior
 from polar_bayes.inference.request import resolve
 from polar_bayes.inference.result import capture_of, provenance_of
 from polar_bayes.observation.data import ANGLES, Observations

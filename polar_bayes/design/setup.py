@@ -18,15 +18,13 @@ from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.files import check_fit
 from polar_bayes.inference.initialization import STARTS
 from polar_bayes.inference.problem import compile_request
-from polar_bayes.inference.program import Program, from_prior, places
+from polar_bayes.inference.program import PRIOR_DRAWS, Program, from_prior, places
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.numerics.compile import compiled
 from polar_bayes.numerics.optimize import Modes, NumpyPotential, ValueAndGradient, find_modes
 from polar_bayes.observation.data import Observations
 from polar_bayes.progress import Progress, no_progress
-
-PRIOR_DRAWS = 500
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

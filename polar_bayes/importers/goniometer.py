@@ -458,11 +458,8 @@ def _interpolation_error(angle: np.ndarray, logs: np.ndarray) -> np.ndarray:
 def _refuse_angles_from_surface(capture: xr.Dataset, angle_is: str | None) -> None:
     """Refuse a Brewster angle below that of vacuum, unless the scale of the angle was stated."""
     (peak,) = indices_by_eye(capture).values()
-    if angle_is is None and peak is not None and peak.high < 1.0:
-        what = (
-            f"the polarization is largest near {peak.angle:.0f} degrees, which would be Brewster's "
-            f"angle of an index of {peak.center:.2f}, below that of vacuum"
-        )
+    if angle_is is None and peak is not None and peak.below_vacuum:
+        what = f"the polarization {peak.below_vacuum}"
         hint = "this looks like angle_is='from-surface'; if not, say angle_is='incidence'"
         raise CaptureError(what, where=capture.attrs["name"], hint=hint)
 

@@ -29,7 +29,7 @@ from polar_bayes.numerics.levenberg_marquardt import (
 )
 from polar_bayes.observation.data import Observations
 
-PRIOR_DRAWS = 32
+CANDIDATES = 32
 """Default number of prior draws among which a starting point is chosen."""
 
 RESTARTS = tuple(range(1, 8))
@@ -57,7 +57,7 @@ class ModeSearch(NamedTuple):
 
 
 def find_starts(
-    batch: ProblemBatch, candidates: int = PRIOR_DRAWS
+    batch: ProblemBatch, candidates: int = CANDIDATES
 ) -> Float[np.ndarray, "pixel rank size"]:
     """Return prior draws from which each pixel starts, the one of highest density first."""
     # The largest program compiles while the others are traced and run.

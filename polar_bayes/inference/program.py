@@ -593,6 +593,10 @@ def begin_from_prior(program: Program, data: Observations) -> None:
     program.drawn_from_prior.begin(_keys_like(BLOCK), BLOCK, data)
 
 
+PRIOR_DRAWS = 500
+"""Draws from the prior that describe a model."""
+
+
 def from_prior(program: Program, key: Array, draws: int, data: Observations) -> np.ndarray:
     """Draw unconstrained vectors from the prior; one compiled program serves any number."""
     keys = keys_of_draws(key, draws)

@@ -12,6 +12,7 @@ from numpyro.primitives import Messenger
 
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, FitError
+from polar_bayes.inference.batching import MIN_VIEWS
 from polar_bayes.inference.model_parts import ModelParts, layout_of
 from polar_bayes.inference.program import ModelInfo, inspect_model
 from polar_bayes.inference.result import Provenance
@@ -279,7 +280,7 @@ def _check_views(capture: xr.Dataset, limit: float) -> None:
     data_valid = capture.get("valid", xr.DataArray(True)) & (capture["view_zenith"] <= limit)
     per_fit = data_valid.broadcast_like(capture["view_zenith"])
     used = int(per_fit.any([d for d in per_fit.dims if d != "view"]).sum())
-    if used < 2:
+    if used < MIN_VIEWS:
         raise CaptureError(
             f"only {used} valid view{'s' if used != 1 else ''} up to {limit:g} degrees",
             where=f"{capture.attrs.get('name', 'capture')}: view",

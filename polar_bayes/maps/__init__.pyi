@@ -5,7 +5,7 @@ from .lazy import (
     criticism_sentences as criticism_sentences,
     open_capture as open_capture,
     open_map as open_map,
-    setup_cautions as setup_cautions,
+    perfect_cautions as perfect_cautions,
     shared_cautions as shared_cautions,
     shared_parameters as shared_parameters,
     start_sentences as start_sentences,

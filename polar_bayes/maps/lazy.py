@@ -359,7 +359,7 @@ def shared_cautions(maps: xr.Dataset) -> list[str]:
     ]
 
 
-def setup_cautions(maps: xr.Dataset) -> list[str]:
+def perfect_cautions(maps: xr.Dataset) -> list[str]:
     """Caution that no interval of a pixel holds what the set-up is known to."""
     perfect = provenance_of(maps).get("perfect")
     if not perfect:

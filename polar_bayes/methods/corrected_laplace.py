@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.inference.batch_modes import (
-    PRIOR_DRAWS,
+    CANDIDATES,
     RESTARTS,
     ModeSearch,
     find_modes_from,
@@ -99,7 +99,7 @@ class CorrectedLaplace(AbstractBatchMethod):
     """
 
     draws: int = 256
-    candidates: int = PRIOR_DRAWS
+    candidates: int = CANDIDATES
     starts: int | None = None
     rounds: int = 3
     sampler: AbstractBatchMethod | None = dataclasses.field(default_factory=Importance)

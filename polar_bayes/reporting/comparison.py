@@ -15,8 +15,9 @@ from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.fit_page import fit_card
 from polar_bayes.reporting.style import BLUE, GRAY, GREEN, ORANGE, PURPLE, SKY, VERMILLION
-from polar_bayes.reporting.text import CLEAR, DASH, column, interval, number, or_dash, percent
+from polar_bayes.reporting.text import DASH, column, interval, number, or_dash, percent
 from polar_bayes.repr_html import Row, Table
+from polar_bayes.scenes.sentences import CLEAR
 
 COLORS = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY, GRAY)
 

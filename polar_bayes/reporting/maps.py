@@ -24,7 +24,7 @@ from polar_bayes.maps.lazy import (
     criticism_sentences,
     ensure_loaded,
     map_parameters,
-    setup_cautions,
+    perfect_cautions,
     shared_cautions,
     shared_parameters,
     start_sentences,
@@ -275,7 +275,7 @@ def map_page(
         cautions=[
             *([page.caption("map.unchecked")] if name == UNCHECKED else []),
             *shared_cautions(maps),
-            *setup_cautions(maps),
+            *perfect_cautions(maps),
         ],
         sections=sections,
         footer="Computed from the maps of every pixel, which stay where they are.",

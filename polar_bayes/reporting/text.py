@@ -33,6 +33,7 @@ from polar_bayes.numerics.psis import MAX_PARETO_K
 from polar_bayes.reporting.page import INSTALL
 from polar_bayes.reporting.style import QUANTITIES, coordinate_labels, short_title
 from polar_bayes.results import MIN_GOOD_SHARE, verdict
+from polar_bayes.scenes.sentences import is_apart
 
 # --- Numbers as text, with the digits that they deserve -------------------------------------------
 
@@ -423,10 +424,6 @@ def _intervals_are(scalars: Sequence[Scalar], posterior: xr.Dataset) -> str:
 
 # --- Comparisons of fits --------------------------------------------------------------------------
 
-CLEAR = 4.0
-"""Difference of expected log densities, in nats, below which it says little (Sivula et al.
-2020)."""
-
 
 def comparison_headline(comparison: FitComparison) -> str:
     """State which fit predicts best, or that the readings do not decide."""
@@ -442,7 +439,7 @@ def comparison_headline(comparison: FitComparison) -> str:
 
 def _is_clearly_worse(row: pd.Series) -> bool:
     """Return whether a fit predicts significantly worse than the best."""
-    return bool(-row["elpd_diff"] >= max(CLEAR, 2.0 * row["dse"]))
+    return bool(is_apart(-float(row["elpd_diff"]), float(row["dse"])))
 
 
 def comparison_of_fits_sentences(comparison: FitComparison) -> list[str]:

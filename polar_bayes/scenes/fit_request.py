@@ -23,7 +23,7 @@ from polar_bayes.capture.schema import count
 from polar_bayes.errors import FitError
 from polar_bayes.inference.prior_probability import has_probabilities, probability_below
 from polar_bayes.inference.problem import Problem, make_problem
-from polar_bayes.inference.program import BLOCK, THREADS, Values, from_prior
+from polar_bayes.inference.program import BLOCK, PRIOR_DRAWS, THREADS, Values, from_prior
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import Provenance, assemble
 from polar_bayes.methods.method import AbstractMethod, find_method
@@ -33,8 +33,6 @@ from polar_bayes.physics.part import parameters_of
 from polar_bayes.priors import support_bounds
 from polar_bayes.progress import Progress
 from polar_bayes.scenes.neighbors import STOPPED, fit_comparisons, removed_terms, try_alternatives
-
-PRIOR_DRAWS = 500
 
 DIAGNOSTICS = ("r_hat", "pareto_k", "ess")
 """Diagnostics that methods state of their draws and results store; None if not stated."""

@@ -14,10 +14,14 @@ from polar_bayes.inference.request import Request
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import describe_prior
 
+CLEAR = 4.0
+"""Difference of expected log densities, in nats, below which it says little (Sivula et al.
+2020)."""
+
 
 def is_apart[T: (float, pd.Series)](difference: T, error: T) -> T:
-    """Return whether an elpd difference (nat) is significant: above 2 standard errors, and 4."""
-    return (difference > 4.0) & (difference > 2.0 * error)
+    """Return whether an elpd difference (nat) is significant: `CLEAR`, and 2 standard errors."""
+    return (difference > CLEAR) & (difference > 2.0 * error)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
