@@ -52,6 +52,7 @@ KEYWORDS = {
     "columns": "--column",
     "constants": "--constant",
     "ignored": "--ignore",
+    "known": "--known",
     "links": "--link",
     "parameter": "--profile",
     "priors": "--prior",
