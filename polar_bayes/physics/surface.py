@@ -331,8 +331,13 @@ class RoughSurface(AbstractSurface):
         cosine, weight = (like(x, geometry.view_zenith) for x in squared_rule(HEMISPHERE_NODES))
         turns = jnp.arange(0.0, 180.0, 180.0 / GROOVE_AZIMUTHS) if self.slopes.turned else [0.0]
         zenith, azimuth = jnp.meshgrid(jnp.rad2deg(jnp.arccos(cosine)), jnp.asarray(turns))
-        some = per_ray(geometry.view_zenith) * 0.0
-        down, around = some + zenith.ravel(), some + azimuth.ravel()
+        start = 0.0 * geometry.view_zenith
+        axes = self.slopes.ellipse(parameters, geometry).axes
+        if axes is not None:
+            # From the grooves, whatever azimuth counts from: a rule of so few is not exact.
+            start = geometry.view_azimuth + jnp.rad2deg(jnp.arctan2(axes.sin, axes.cos))
+        some = per_ray(start) * 0.0
+        down, around = some + zenith.ravel(), per_ray(start) + azimuth.ravel()
         views = Geometry(down, around, down, around)
         passing = self.exit(per_ray(dict(parameters)), views, per_ray(stack)).intensity
         share = jnp.tile(2.0 * cosine * weight, len(turns)) / len(turns)
