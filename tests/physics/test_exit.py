@@ -10,6 +10,7 @@ from cases import each
 
 from polar_bayes.errors import SceneError
 from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
+from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import PointSource
 from polar_bayes.physics.microfacet import GGX, AnisotropicSlopes
@@ -177,11 +178,40 @@ def test_a_film_on_facets_needs_facets_both_ways() -> None:
     """Its reflectance changes with the angle, so that a plane lets out what facets reflect, too."""
     film, stack = ThinFilm(1.9, 500.0), CoatStack((ClearCoat(1.5, 0.0), ThinFilm(1.9, 500.0)))
     for coat in (film, stack):
-        with pytest.raises(SceneError, match=r"ThinFilm.*RoughPassage"):
-            Scene(RoughSurface(way_out=SmoothExit()), WHITE, StokesMixing(), coat)
-    scene = Scene(RoughSurface(), WHITE, StokesMixing(), film)
-    assert "RoughExit -> SmoothExit" not in [effect.name for effect in effects_of(scene)]
-    assert Scene(RoughSurface(way_out=SmoothExit()), coat=film).coat is film
+        for way_out in (SmoothExit(), RoughExit()):
+            with pytest.raises(SceneError, match=r"ThinFilm.*RoughPassage"):
+                Scene(RoughSurface(way_out=way_out), WHITE, StokesMixing(), coat)
+    scene = Scene(RoughSurface(way_out=RoughPassage()), WHITE, StokesMixing(), film)
+    assert not [effect for effect in effects_of(scene) if effect.key_path[-1] == "way_out"]
+    assert Scene(RoughSurface(), coat=film).coat is film
+
+
+@pytest.mark.thorough
+def test_a_plane_under_filmed_facets_makes_light_that_no_number_of_facets_mends() -> None:
+    """Why a scene refuses it: what enters through a plane, and what facets reflect of the beam."""
+    node, weight = np.polynomial.legendre.leggauss(40)
+    cosine, turn = 0.5 * (1.0 + node), 4.5 + 9.0 * np.arange(40)
+    grids = np.meshgrid(np.rad2deg(np.arccos(cosine)), turn, indexing="ij")
+    views = Geometry.from_degrees(
+        view_zenith=grids[0].ravel(),
+        view_azimuth=grids[1].ravel(),
+        light_zenith=60.0,
+        light_azimuth=0.0,
+        wavelength=550.0,
+    )
+    material, film = {"roughness": 0.5, "refractive_index": 1.2}, ThinFilm(1.9, 500.0)
+    light = light_of(Scene(RoughSurface(), coat=film), material, views).intensity.reshape(40, 40)
+    mirrored = np.sum(light * (0.5 * weight * cosine)[:, None]) * 2.0 * np.pi / 40.0
+    given = {name: jnp.array([value]) for name, value in material.items()}
+    stack = Stack(given["refractive_index"], film.layers(given, jnp.array([550.0])))
+    one = jax.tree.map(lambda x: x[:1], views._replace(wavelength=None))
+    for nodes in (FacetQuadrature(), FacetQuadrature(14, 12)):
+        plane, facets = (
+            float(entering_of(RoughSurface(quadrature=nodes, way_out=way), given, one, stack)[0][0])
+            for way in (RoughExit(), RoughPassage())
+        )
+        assert 2.0 * (mirrored + plane) == pytest.approx(1.045, abs=0.001)
+        assert 2.0 * (mirrored + facets) < 1.0
 
 
 def test_how_much_light_gets_into_a_body_agrees_with_a_walk(transmittances: np.ndarray) -> None:

@@ -41,6 +41,7 @@ from polar_bayes.physics.subsurface import Depolarizer, Lambertian, TurbidMedium
 from polar_bayes.physics.surface import (
     InternalReflection,
     RoughExit,
+    RoughPassage,
     RoughSurface,
     SmoothExit,
     SmoothSurface,
@@ -66,7 +67,7 @@ READ = [
     ),
     (
         Scene(  # the material's in their order, then the light, then the instrument
-            RoughSurface(GGX(), BEAM, slopes=GROOVED),
+            RoughSurface(GGX(), BEAM, slopes=GROOVED, way_out=RoughPassage()),
             Lambertian("albedo"),
             StokesMixing(),
             CoatStack((FILM, LACQUER)),
