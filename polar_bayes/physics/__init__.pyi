@@ -45,6 +45,7 @@ from .phase_function import (
 )
 from .scene import Scene as Scene
 from .second_bounce import TwoBounceSurface as TwoBounceSurface
+from .second_passage import TwoFacetPassage as TwoFacetPassage
 from .stokes import LinearPolarization as LinearPolarization
 from .subsurface import (
     AbstractSubsurface as AbstractSubsurface,

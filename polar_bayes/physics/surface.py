@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from polar_bayes.physics.boundary import Diattenuation
 from polar_bayes.physics.coat import BackFace
 from polar_bayes.physics.facets import FacetQuadrature, Facets, Microsurface, seen, sum_facets
 from polar_bayes.physics.geometry import (
@@ -108,11 +109,18 @@ class RoughExit(AbstractExit):
         sample = facets.sample(geometry, seen)
         # A barrier keeps facets from being found anew for each of their readers; see `facets`.
         sample = Facets(*jax.lax.optimization_barrier(tuple(sample)))
-        passing = per_facet(stack).transmission(sample.cos_incidence, sample.sin_squared)
+        passing = self.passing(facets, sample, stack, geometry)
         area = jnp.sum(sample.weight, axis=-2)
         light = sum_facets(sample, sample.weight, passing)
         light = light._replace(intensity=quotient(light.intensity, area))
         return Light(*jax.lax.optimization_barrier(tuple(light)))
+
+    def passing(
+        self, facets: Microsurface, sample: Facets, stack: Stack, geometry: Geometry
+    ) -> Diattenuation:
+        """What comes through of the light at each facet of a sample."""
+        del facets, geometry
+        return per_facet(stack).transmission(sample.cos_incidence, sample.sin_squared)
 
 
 @dataclasses.dataclass(frozen=True)

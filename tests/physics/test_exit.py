@@ -13,9 +13,10 @@ from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import PointSource
-from polar_bayes.physics.microfacet import GGX, AnisotropicSlopes
+from polar_bayes.physics.microfacet import GGX, AnisotropicSlopes, Beckmann
 from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.second_passage import TwoFacetPassage
 from polar_bayes.physics.stack import Layer, Stack
 from polar_bayes.physics.stokes import Light, LinearPolarization
 from polar_bayes.physics.subsurface import Lambertian
@@ -110,6 +111,7 @@ def test_what_passes_facets_both_ways_gives_back_no_more_than_comes(light_zenith
     rule = 2e-4
     for roughness in (0.2, 0.5):
         assert returned(RoughPassage(), light_zenith, roughness) <= 1.0 + rule
+        assert returned(TwoFacetPassage(), light_zenith, roughness) <= 1.0004 + rule
         assert returned(RoughExit(), light_zenith, roughness) <= 1.014 + rule
         assert returned(SmoothExit(), light_zenith, roughness) <= 1.003 + rule
 
@@ -136,12 +138,9 @@ def swapped(way_out: AbstractExit, roughness: float, zenith: float, **parts: obj
 def test_viewer_and_light_may_change_places_where_light_passes_facets_both_ways() -> None:
     for parts in ({}, {"slopes": AnisotropicSlopes(30.0)}, {"distribution": GGX()}):
         for roughness, zenith in ((0.1, 60.0), (0.3, 85.0)):
-            assert swapped(RoughPassage(), roughness, zenith, **parts) == pytest.approx(
-                1.0, rel=1e-12
-            )
-            assert swapped(SmoothExit(), roughness, zenith, **parts) == pytest.approx(
-                1.0, rel=1e-12
-            )
+            for way_out in (SmoothExit(), RoughPassage(), TwoFacetPassage()):
+                found = swapped(way_out, roughness, zenith, **parts)
+                assert found == pytest.approx(1.0, rel=1e-12)
 
 
 def test_how_far_a_plane_on_the_way_in_is_from_reciprocal() -> None:
@@ -167,8 +166,11 @@ def test_polarized_light_enters_through_facets_as_it_leaves() -> None:
     s, p, none = (entering(angle, RoughPassage(), 0.2).intensity for angle in (0.0, 90.0, None))
     np.testing.assert_allclose((s + p) / 2.0, none, rtol=1e-12)
     for angle in (None, 0.0, 30.0, 90.0):
-        rough, plane = (entering(angle, way, 1e-5) for way in (RoughPassage(), SmoothExit()))
-        np.testing.assert_allclose(rough, plane, atol=1e-8)
+        plane, *rough = (
+            entering(angle, way, 1e-5) for way in (SmoothExit(), RoughPassage(), TwoFacetPassage())
+        )
+        for each_way in rough:
+            np.testing.assert_allclose(each_way, plane, atol=1e-8)
 
 
 # --- what a plane on the way in costs ------------------------------------------------------------
@@ -212,6 +214,34 @@ def test_a_plane_under_filmed_facets_makes_light_that_no_number_of_facets_mends(
         )
         assert 2.0 * (mirrored + plane) == pytest.approx(1.045, abs=0.001)
         assert 2.0 * (mirrored + facets) < 1.0
+
+
+def test_light_that_one_facet_reflects_enters_at_the_next(
+    transmittances: np.ndarray, height_field_exit: np.ndarray
+) -> None:
+    """Within 1.3% of a walk, and so is the way out of a height field, within 1.8% and .004 of q.
+
+    `RoughPassage` is 6%, 4.7% and .0105 off.
+    """
+    roughness, zenith, index, share = transmittances.T[:4]
+    height_field = height_field_exit.T
+    # What leaves a body of unit radiance inside is n^2 times the table.
+    cases = (
+        (GGX(), roughness, zenith, index, share),
+        (Beckmann(), *height_field[1:3], height_field[0], height_field[0] ** 2 * height_field[4]),
+    )
+    for distribution, roughness, zenith, index, share in cases:
+        views = Geometry(zenith[:, None], 0.0 * zenith[:, None], *np.zeros((2, zenith.size, 1)))
+        found = exit_of(
+            RoughSurface(distribution, way_out=TwoFacetPassage()),
+            {"roughness": roughness[:, None]},
+            views,
+            Stack(jnp.asarray(index[:, None])),
+        )
+        off = np.asarray(found.intensity)[:, 0] / share - 1.0
+        assert np.all(np.abs(off) < (0.013 if distribution == GGX() else 0.018))
+    off = np.asarray(found.q)[:, 0] - height_field[5] / height_field[4]
+    assert np.all(np.abs(off) < 0.004)
 
 
 def test_how_much_light_gets_into_a_body_agrees_with_a_walk(transmittances: np.ndarray) -> None:

@@ -39,15 +39,10 @@ from polar_bayes.physics.microfacet import (
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
 from polar_bayes.physics.phase_function import HenyeyGreenstein
 from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.second_passage import TwoFacetPassage
 from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian, Unpolarized
-from polar_bayes.physics.surface import (
-    InternalReflection,
-    RoughPassage,
-    RoughSurface,
-    SmoothExit,
-    SmoothSurface,
-)
+from polar_bayes.physics.surface import InternalReflection, RoughSurface, SmoothExit, SmoothSurface
 
 BEAM = PointSource(LinearPolarization("light_degree", "light_angle"))
 GROOVED = AnisotropicSlopes("roughness_azimuth")
@@ -63,7 +58,7 @@ SCENES = {
         Instrument((AngleZero(), BeamOverlap(), DolpGain(), DarkLevel(), Saturation(0.2))),
     ),
     "grooves under a sky, with a film": Scene(
-        RoughSurface(GGX(), UniformSky(), FEW, GROOVED, way_out=RoughPassage()),
+        RoughSurface(GGX(), UniformSky(), FEW, GROOVED, way_out=TwoFacetPassage()),
         Depolarizer(),
         DopMixing(signed=True),
         ThinFilm(),

@@ -36,6 +36,7 @@ from polar_bayes.physics.mixing import DopMixing, StokesMixing
 from polar_bayes.physics.phase_function import HenyeyGreenstein
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, SCENES, Scene
 from polar_bayes.physics.second_bounce import TwoBounceSurface
+from polar_bayes.physics.second_passage import TwoFacetPassage
 from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian, TurbidMedium, Unpolarized
 from polar_bayes.physics.surface import (
@@ -120,6 +121,7 @@ SIMPLER = [
     (SeparableShadowing(), ()),
     (RoughExit(), (SmoothExit(),)),
     (SmoothExit(), ()),
+    (TwoFacetPassage(), (RoughPassage(), RoughExit(), SmoothExit())),
     (
         TwoBounceSurface(GGX()),
         (
