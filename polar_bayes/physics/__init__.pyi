@@ -18,6 +18,7 @@ from .illumination import (
     AbstractIllumination as AbstractIllumination,
     Disc as Disc,
     PointSource as PointSource,
+    SunAndSky as SunAndSky,
     UniformSky as UniformSky,
 )
 from .microfacet import (

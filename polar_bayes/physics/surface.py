@@ -318,7 +318,7 @@ class RoughSurface(AbstractSurface):
     ) -> Beams:
         if not self.way_out.both_ways:
             return self.illumination.beams(stack, geometry, parameters, around)
-        rays, irradiance = self.illumination.rays(geometry, around)
+        rays, irradiance = self.illumination.rays(geometry, parameters, around)
         each = per_ray(dict(parameters))
         passing = self.exit(each, rays.reversed(), per_ray(stack))
         power = irradiance * cos_degrees(rays.light_zenith) * passing.intensity

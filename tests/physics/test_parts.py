@@ -11,7 +11,7 @@ from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
 from polar_bayes.physics.dispersion import Cauchy, Sellmeier
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
-from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
+from polar_bayes.physics.illumination import Disc, PointSource, SunAndSky, UniformSky
 from polar_bayes.physics.instrument import (
     Analyzer,
     AngleZero,
@@ -122,6 +122,7 @@ SIMPLER = [
     (RoughExit(), (SmoothExit(),)),
     (SmoothExit(), ()),
     (TwoFacetPassage(), (RoughPassage(), RoughExit(), SmoothExit())),
+    (SunAndSky(0.05), (PointSource(), UniformSky())),
     (
         TwoBounceSurface(GGX()),
         (
