@@ -1,22 +1,23 @@
 r"""Light that one facet of a rough surface reflects, and that passes into the body at the next.
 
-Of the facets i that a direction v sees, with shares w_i, those that pass light at once pass
-E = sum w_i T_i. Light that facet i mirrors into the ray r_i is free with the probability f_i of a
-walk in Smith's model; what is not free meets a next facet, and passes there. The ray runs about as
-flat as v does, so that the next facet passes as much as the first one on average:
+Light that facet i mirrors into the ray r_i escapes with the probability f_i of a walk in Smith's
+model; the rest meets a next facet, and passes there. The ray runs about as flat as v does, so that
+the next facet counts as the mean of all facets that v sees, which have the shares w_i. With
+B = sin^2 theta, and T, R and K of `polar_bayes.physics.boundary`, the mean facet passes E of
+unpolarized light and polarizes it by C:
 
-$$ E_0 = \sum_i w_i [T_i + (1 - f_i) E R_i], \qquad
+$$ E = \sum_i w_i T_i, \qquad C = \frac{\sum_i w_i K_i B_i \cos 2\psi_i}{\sum_i w_i B_i}, \qquad
    f = \frac{1 + \Lambda_v}{1 + \Lambda_v + \Lambda_r} \text{ for rays that rise, else } 0 $$
 
-A mirror polarizes the other way round than a boundary that light passes. What arrives at it counts
-as unpolarized:
+A mirror polarizes the other way round than a boundary that light passes:
 
-$$ E_1 = -\sum_i w_i K_i [1 - (1 - f_i) E] \sin^2\theta_i \cos 2\psi_i $$
+$$ E_0 = \sum_i w_i [T_i + (1 - f_i) (E R_i - C K_i B_i^2)], \qquad
+   E_1 = -\sum_i w_i [K_i - (1 - f_i) (E K_i - C R_i)] B_i \cos 2\psi_i $$
 
 Source:
     Heitz, Hanika, d'Eon & Dachsbacher 2016, Multiple-scattering microfacet BSDFs with the Smith
-    model, ACM Trans. Graph. 35, 58: which rays are free. The mean E at the next facet is our own,
-    measured by a walk (docs/scenes.md).
+    model, ACM Trans. Graph. 35, 58: which rays escape. The mean facet as the next one is an
+    approximation of ours, measured by a walk and by a height field (docs/scenes.md).
 """
 
 import dataclasses
@@ -37,11 +38,12 @@ from polar_bayes.physics.surface import RoughExit, RoughPassage, SmoothExit
 class TwoFacetPassage(RoughPassage):
     """`RoughPassage`, where light that one facet reflects passes at the next one.
 
-    Where `RoughPassage` lets up to 6% too little into the body, this is within 1.5% of a walk
-    (docs/scenes.md). Viewer and light may change places, and nothing is made: what passes at the
-    next facet is part of what the first bounce of any surface hides.
+    Where `RoughPassage` lets up to 6% too little into the body, this is within 1.3% of a walk
+    (docs/scenes.md). Viewer and light may change places. What passes at the next facet is part of
+    what the first bounce hides, so that a white body gives back at most 1.0004 of the light. The
+    second bounce of `TwoBounceSurface` reflects part of the same light: there it is up to 1.0044.
 
-    Which rays are free follows a walk whatever `shadowing` the surface has.
+    Which rays escape follows a walk in Smith's model whatever `shadowing` the surface has.
     """
 
     @override

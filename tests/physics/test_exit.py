@@ -212,7 +212,7 @@ def test_a_plane_under_filmed_facets_makes_light_that_no_number_of_facets_mends(
             float(entering_of(RoughSurface(quadrature=nodes, way_out=way), given, one, stack)[0][0])
             for way in (RoughExit(), RoughPassage())
         )
-        assert 2.0 * (mirrored + plane) == pytest.approx(1.045, abs=0.001)
+        assert 2.0 * (mirrored + plane) == pytest.approx(1.043, abs=0.0005)
         assert 2.0 * (mirrored + facets) < 1.0
 
 
