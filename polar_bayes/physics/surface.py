@@ -337,8 +337,9 @@ class RoughSurface(AbstractSurface):
             return stack.escape()
         # Azimuths a right angle apart see the same grooves from both sides of an axis of theirs.
         cosine, weight = (like(x, geometry.view_zenith) for x in squared_rule(HEMISPHERE_NODES))
-        turns = jnp.arange(0.0, 180.0, 180.0 / GROOVE_AZIMUTHS) if self.slopes.turned else [0.0]
-        zenith, azimuth = jnp.meshgrid(jnp.rad2deg(jnp.arccos(cosine)), jnp.asarray(turns))
+        count = GROOVE_AZIMUTHS if self.slopes.turned else 1
+        turns = jnp.arange(count, dtype=cosine.dtype) * (180.0 / count)
+        zenith, azimuth = jnp.meshgrid(jnp.rad2deg(jnp.arccos(cosine)), turns)
         start = 0.0 * geometry.view_zenith
         axes = self.slopes.ellipse(parameters, geometry).axes
         if axes is not None:
@@ -348,7 +349,7 @@ class RoughSurface(AbstractSurface):
         down, around = some + zenith.ravel(), per_ray(start) + azimuth.ravel()
         views = Geometry(down, around, down, around)
         passing = self.exit(per_ray(dict(parameters)), views, per_ray(stack)).intensity
-        share = jnp.tile(2.0 * cosine * weight, len(turns)) / len(turns)
+        share = jnp.tile(2.0 * cosine * weight, count) / count
         more = jnp.sum(share * passing, axis=-1) - stack.hemispherical_transmission()
         return stack.escape() + more / parameters["refractive_index"] ** 2
 
