@@ -26,6 +26,7 @@ from polar_bayes.physics.illumination import UniformSky
 from polar_bayes.physics.microfacet import GGX, HeightCorrelatedShadowing, SeparableShadowing
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.second_bounce import TwoBounceSurface
+from polar_bayes.physics.second_passage import TwoFacetPassage
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.surface import RoughPassage, RoughSurface, SmoothExit
 
@@ -206,9 +207,10 @@ def transmittances(count: int) -> np.ndarray:
 
 def table_of_bodies(rows: np.ndarray) -> None:
     """Print how much light gets into a body, and by how much each way out is off."""
-    ways = (SmoothExit(), RoughPassage())
-    click.echo("| roughness | zenith | walk | a plane (RoughExit) | RoughPassage |")
-    click.echo("|---|---|---|---|---|")
+    ways = (SmoothExit(), RoughPassage(), TwoFacetPassage())
+    names = "a plane (RoughExit) | RoughPassage | TwoFacetPassage"
+    click.echo(f"| roughness | zenith | walk | {names} |")
+    click.echo("|---|---|---|---|---|---|")
     for row in rows:
         roughness, zenith, index, share = row[:4]
         views = Geometry.from_degrees(

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import override
+from typing import Self, override
 
 
 class PolarBayesError(ValueError):
@@ -17,6 +17,10 @@ class PolarBayesError(ValueError):
     def __init__(self, what: str, *, where: str, hint: str) -> None:
         self.what, self.where, self.hint = (one_line(text) for text in (what, where, hint))
         super().__init__(f"{self.where}: {self.what}; {self.hint}")
+
+    def within(self, where: str) -> Self:
+        """Return the error with the file or entry that holds its place in front of it."""
+        return type(self)(self.what, where=f"{where}: {self.where}", hint=self.hint)
 
     @override
     def __reduce__(self) -> tuple[Callable[[], "PolarBayesError"], tuple[()]]:

@@ -86,8 +86,8 @@ class _Parser:
         keywords = {str(part.arg): self._value(part.value) for part in node.keywords}
         try:
             return made(*arguments, **keywords)
-        except PolarBayesError:
-            raise
+        except PolarBayesError as refusal:
+            raise refusal.within(self.where) from None
         except Exception as problem:  # whatever a constructor says of its arguments
             said = str(problem).replace(f"{name}.__init__()", name).rstrip(".")
             takes = (each for each in inspect.signature(made).parameters if each != "validate_args")

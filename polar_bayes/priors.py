@@ -474,6 +474,8 @@ _ROWS: dict[str, dist.Distribution] = {
     "film_thickness": dist.LogNormal(math.log(200.0), 0.7),
     # A blackened back sends nothing, a beam that the detector catches whole sends all.
     "back_face_share": Beta(1.0, 1.0),
+    # A clear sky: a sixth of the light of the sun over a hemisphere; haze has several times that.
+    "sky_radiance": dist.LogNormal(math.log(0.05), 1.0),
     # How far the normal leans from the stated one: that of a sample laid down by eye.
     "normal_tilt_x": dist.Normal(0.0, 2.0),
     "normal_tilt_y": dist.Normal(0.0, 2.0),

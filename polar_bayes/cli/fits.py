@@ -273,8 +273,12 @@ def effects(capture: Path, as_json: bool, out: Path | None, **settings: Any) -> 
 def scene(source: Path | str, out: Path | None) -> None:
     """Write the scene, links, priors and method of a result as a file that --scene takes."""
     found = source if isinstance(source, str) else pb.load(source)
+    try:
+        text = pb.scenes.scene_text(found)
+    except pb.PolarBayesError as error:
+        raise error.within(str(source)) from None
     if out is None:
-        click.echo(pb.scenes.scene_text(found), nl=False)
+        click.echo(text, nl=False)
     else:
         pb.save_scene(found, out)
         click.echo(f"{out}: edit it, and give it as --scene {out}")

@@ -18,6 +18,7 @@ from .illumination import (
     AbstractIllumination as AbstractIllumination,
     Disc as Disc,
     PointSource as PointSource,
+    SunAndSky as SunAndSky,
     UniformSky as UniformSky,
 )
 from .microfacet import (
@@ -45,6 +46,7 @@ from .phase_function import (
 )
 from .scene import Scene as Scene
 from .second_bounce import TwoBounceSurface as TwoBounceSurface
+from .second_passage import TwoFacetPassage as TwoFacetPassage
 from .stokes import LinearPolarization as LinearPolarization
 from .subsurface import (
     AbstractSubsurface as AbstractSubsurface,

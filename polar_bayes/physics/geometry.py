@@ -178,13 +178,13 @@ def mirror_facet(geometry: Geometry) -> MirrorFacet:
     sin_view, cos_view = sin_degrees(geometry.view_zenith), cos_degrees(geometry.view_zenith)
     sin_light, cos_light = sin_degrees(geometry.light_zenith), cos_degrees(geometry.light_zenith)
     half_difference = 0.5 * (geometry.view_zenith - geometry.light_zenith)
-    half_sum = 0.5 * (geometry.view_zenith + geometry.light_zenith)
+    cos_half_sum = _cos_half_sum(geometry)
     sin_sin = sin_view * sin_light
 
     sin_squared = sin_degrees(half_difference) ** 2 + sin_sin * sin_half**2
-    cos_squared = cos_degrees(half_sum) ** 2 + sin_sin * cos_half**2
+    cos_squared = cos_half_sum**2 + sin_sin * cos_half**2
     cosine_sum = cos_view + cos_light
-    slope_in_plane = 2.0 * cos_degrees(half_sum) * sin_degrees(half_difference) / cosine_sum
+    slope_in_plane = 2.0 * cos_half_sum * sin_degrees(half_difference) / cosine_sum
     slope_squared = slope_in_plane**2 + sin_sin * (2.0 * cos_half / cosine_sum) ** 2
 
     x = sin_degrees(2.0 * half_difference) + 2.0 * cos_view * sin_light * sin_half**2
@@ -205,8 +205,7 @@ def mirror_slopes(geometry: Geometry) -> tuple[Array, Array]:
     sin_light = sin_degrees(geometry.light_zenith)
     cosine_sum = cos_degrees(geometry.view_zenith) + cos_degrees(geometry.light_zenith)
     half_difference = sin_degrees(0.5 * (geometry.view_zenith - geometry.light_zenith))
-    half_sum = cos_degrees(0.5 * (geometry.view_zenith + geometry.light_zenith))
-    in_plane = 2.0 * (half_difference * half_sum + sin_light * cos_half**2)
+    in_plane = 2.0 * (half_difference * _cos_half_sum(geometry) + sin_light * cos_half**2)
     return in_plane / cosine_sum, 2.0 * sin_light * sin_half * cos_half / cosine_sum
 
 
@@ -223,12 +222,17 @@ def turn_between_frames(geometry: Geometry) -> tuple[Array, Array]:
     """
     sin_half, cos_half = _half_azimuth(geometry.light_azimuth - geometry.view_azimuth)
     half_difference = 0.5 * (geometry.view_zenith - geometry.light_zenith)
-    half_sum = 0.5 * (geometry.view_zenith + geometry.light_zenith)
     up = cos_degrees(half_difference) * cos_half
-    down = cos_degrees(half_sum) * sin_half
+    down = _cos_half_sum(geometry) * sin_half
     length = up**2 + down**2
     cos, sin = double_angle(down, up)
     return double_angle(cos / length, sin / length)
+
+
+def _cos_half_sum(geometry: Geometry) -> Array:
+    """Cosine of half the sum of both zeniths."""
+    # From their complements, which are exact near grazing, where single precision rounds the sum.
+    return sin_degrees(0.5 * ((90.0 - geometry.view_zenith) + (90.0 - geometry.light_zenith)))
 
 
 def _half_azimuth(azimuth: Array) -> tuple[Array, Array]:

@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 import math
-from typing import override
+from typing import Annotated, override
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +19,18 @@ from polar_bayes.physics.geometry import (
     per_ray,
     sin_degrees,
 )
-from polar_bayes.physics.part import Parameters, Part, check_part, like, squared_rule, unit_rule
+from polar_bayes.physics.mixing import StokesMixing
+from polar_bayes.physics.part import (
+    Parameters,
+    Part,
+    Range,
+    Setting,
+    check_part,
+    like,
+    squared_rule,
+    unit_rule,
+    value_of,
+)
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.stokes import (
     Light,
@@ -70,11 +81,14 @@ class AbstractIllumination(Part):
         """
 
     @abc.abstractmethod
-    def rays(self, geometry: Geometry, around: Turns = FOUR_TURNS) -> tuple[Geometry, Array]:
+    def rays(
+        self, geometry: Geometry, parameters: Parameters, around: Turns = FOUR_TURNS
+    ) -> tuple[Geometry, Array]:
         """Beams that represent the source, for bodies that depend on the direction of light.
 
         Args:
             geometry: Directions. Shape (..., view), degree.
+            parameters: Material parameters by name, for those of the light itself.
             around: Azimuths from that of the viewer, degree, and their shares, which stand for
                 all azimuths of a source that is alike all around.
 
@@ -96,7 +110,7 @@ class AbstractIllumination(Part):
         around: Turns = FOUR_TURNS,
     ) -> Beams:
         """Light that passes into the body, ray by ray; see `rays` and `entering`."""
-        rays, irradiance = self.rays(geometry, around)
+        rays, irradiance = self.rays(geometry, parameters, around)
         cos_light = cos_degrees(rays.light_zenith)
         passing = per_ray(stack).transmission(cos_light, sin_degrees(rays.light_zenith) ** 2)
         light = transmit_inward(passing, cos_light, self.incident(per_ray(dict(parameters)), rays))
@@ -150,7 +164,9 @@ class PointSource(AbstractIllumination):
         return transmit_inward(passing, cos_light, self.incident(parameters, geometry))
 
     @override
-    def rays(self, geometry: Geometry, around: Turns = FOUR_TURNS) -> tuple[Geometry, Array]:
+    def rays(
+        self, geometry: Geometry, parameters: Parameters, around: Turns = FOUR_TURNS
+    ) -> tuple[Geometry, Array]:
         rays = per_ray(geometry)
         return rays, jnp.ones_like(rays.light_zenith)
 
@@ -218,7 +234,9 @@ class UniformSky(AbstractExtendedSource):
         return Light(passing, jnp.zeros_like(passing), jnp.zeros_like(passing))
 
     @override
-    def rays(self, geometry: Geometry, around: Turns = FOUR_TURNS) -> tuple[Geometry, Array]:
+    def rays(
+        self, geometry: Geometry, parameters: Parameters, around: Turns = FOUR_TURNS
+    ) -> tuple[Geometry, Array]:
         # A squared cosine for the nodes, since transmission is steep at grazing.
         cosine, weight = squared_rule(8)
         rays = per_ray(geometry)
@@ -272,7 +290,9 @@ class Disc(AbstractExtendedSource):
         return Light(passing, jnp.zeros_like(passing), jnp.zeros_like(passing))
 
     @override
-    def rays(self, geometry: Geometry, around: Turns = FOUR_TURNS) -> tuple[Geometry, Array]:
+    def rays(
+        self, geometry: Geometry, parameters: Parameters, around: Turns = FOUR_TURNS
+    ) -> tuple[Geometry, Array]:
         rays = per_ray(geometry)
         sin_view, cos_view = sin_degrees(rays.view_zenith), cos_degrees(rays.view_zenith)
         cosine, along, solid_angle = (like(x, cos_view) for x in self._directions())
@@ -303,3 +323,67 @@ class Disc(AbstractExtendedSource):
         ring_solid_angle = 4.0 * np.pi * weight * square / count
         along = np.outer(sine, np.cos(azimuth)).ravel()
         return np.repeat(cosine, count), along, np.repeat(ring_solid_angle, count)
+
+
+@dataclasses.dataclass(frozen=True)
+class SunAndSky(AbstractIllumination):
+    r"""A beam of unit irradiance under a uniform sky, both unpolarized.
+
+    $$ S = S_\text{point} + L S_\text{sky} $$
+
+    Args:
+        sky_radiance: L, what a steradian of the sky brings over what the beam brings across itself,
+            1/sr, 0 to 1000; a name fits it. A clear sky gives about a sixth of the sun's light:
+            .05.
+
+    Raises:
+        SceneError: The radiance is neither a number in that range nor a name.
+    """
+
+    sky_radiance: Annotated[Setting, Range(0.0, 1e3)]
+
+    @override
+    def simpler(self) -> tuple[Part | None, ...]:
+        return (PointSource(), UniformSky())
+
+    @override
+    def reflect(
+        self, facets: Microsurface, stack: Stack, geometry: Geometry, parameters: Parameters
+    ) -> Light:
+        sun, sky = (
+            source.reflect(facets, stack, geometry, parameters)
+            for source in (PointSource(), UniformSky())
+        )
+        return self._both(sun, sky, parameters)
+
+    @override
+    def entering(self, stack: Stack, geometry: Geometry, parameters: Parameters) -> Light:
+        sun, sky = (
+            source.entering(stack, geometry, parameters) for source in (PointSource(), UniformSky())
+        )
+        return self._both(sun, sky, parameters)
+
+    @override
+    def rays(
+        self, geometry: Geometry, parameters: Parameters, around: Turns = FOUR_TURNS
+    ) -> tuple[Geometry, Array]:
+        (sun, beam), (sky, radiance) = (
+            source.rays(geometry, parameters, around) for source in (PointSource(), UniformSky())
+        )
+        radiance = per_ray(value_of(self.sky_radiance, parameters)) * radiance
+        views = jnp.broadcast_shapes(*(x.shape[:-1] for x in (beam, sky.light_azimuth, radiance)))
+        zenith, azimuth, irradiance = (
+            jnp.concatenate([jnp.broadcast_to(x, (*views, x.shape[-1])) for x in both], axis=-1)
+            for both in (
+                (sun.light_zenith, sky.light_zenith),
+                (sun.light_azimuth, sky.light_azimuth),
+                (beam, radiance),
+            )
+        )
+        return sun._replace(light_zenith=zenith, light_azimuth=azimuth), irradiance
+
+    def _both(self, sun: Light, sky: Light, parameters: Parameters) -> Light:
+        """Their Stokes vectors, of which the mixture is a share."""
+        radiance = value_of(self.sky_radiance, parameters)
+        light = StokesMixing().mix(radiance / (1.0 + radiance), sun, sky)
+        return light._replace(intensity=(1.0 + radiance) * light.intensity)

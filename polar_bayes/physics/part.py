@@ -195,6 +195,7 @@ NOTATION: dict[str, Quantity] = {
     "absorption_level": Quantity("", "level of a over wavelength"),
     "absorption_amplitude": Quantity("", "departure of log a from its level"),
     "absorption_length": Quantity("", "length over which a changes", "nm"),
+    "sky_radiance": Quantity("L", "radiance of the sky over the irradiance of the sun", "1/sr"),
     "angle_zero": Quantity("", "offset of both zenith angles", "degree"),
     "beam_overlap_zenith": Quantity("", "zenith where the beam fills the sample", "degree"),
     "dolp_gain": Quantity("", "share of the polarization that is recorded"),

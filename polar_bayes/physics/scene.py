@@ -37,7 +37,6 @@ from polar_bayes.physics.surface import (
     Interface,
     InternalReflection,
     RoughSurface,
-    SmoothExit,
     SmoothSurface,
 )
 from polar_bayes.repr_html import HTMLRepr, Row, Table
@@ -61,8 +60,8 @@ class Scene(HTMLRepr):
         normal: TiltedNormal(), where the stated normal may be wrong; or None where it is right.
 
     Raises:
-        SceneError: A part is of the wrong kind, one is missing beside another, or light of a body
-            leaves facets under a thin film as through a plane.
+        SceneError: A part is of the wrong kind, one is missing beside another, or light enters a
+            body under filmed facets as through a plane.
     """
 
     surface: AbstractSurface
@@ -95,11 +94,12 @@ class Scene(HTMLRepr):
             what = "nothing says how its light adds to the surface's"
             hint = "give mixing=StokesMixing() or DopMixing(), or leave subsurface=None"
             raise SceneError(what, where="subsurface", hint=hint)
-        plane = isinstance(self.surface, RoughSurface) and self.surface.way_out == SmoothExit()
+        way_out = self.surface.way_out if isinstance(self.surface, RoughSurface) else None
+        plane = way_out is not None and not way_out.both_ways
         if plane and self.subsurface is not None and _has_film(self.coat):
-            what = "facets under a thin film reflect what a plane under it lets out, up to 4% twice"
+            what = "facets under a thin film reflect what a plane under it lets in, up to 4% twice"
             hint = "give the surface way_out=RoughPassage(), which makes no light"
-            where = "way_out: SmoothExit() with ThinFilm"
+            where = f"way_out: {way_out!r} with ThinFilm"
             raise UnsuitablePartsError(what, where=where, hint=hint)
 
     @property

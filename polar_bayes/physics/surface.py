@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from polar_bayes.physics.boundary import Diattenuation
 from polar_bayes.physics.coat import BackFace
 from polar_bayes.physics.facets import FacetQuadrature, Facets, Microsurface, seen, sum_facets
 from polar_bayes.physics.geometry import (
@@ -108,11 +109,18 @@ class RoughExit(AbstractExit):
         sample = facets.sample(geometry, seen)
         # A barrier keeps facets from being found anew for each of their readers; see `facets`.
         sample = Facets(*jax.lax.optimization_barrier(tuple(sample)))
-        passing = per_facet(stack).transmission(sample.cos_incidence, sample.sin_squared)
+        passing = self.passing(facets, sample, stack, geometry)
         area = jnp.sum(sample.weight, axis=-2)
         light = sum_facets(sample, sample.weight, passing)
         light = light._replace(intensity=quotient(light.intensity, area))
         return Light(*jax.lax.optimization_barrier(tuple(light)))
+
+    def passing(
+        self, facets: Microsurface, sample: Facets, stack: Stack, geometry: Geometry
+    ) -> Diattenuation:
+        """What comes through of the light at each facet of a sample."""
+        del facets, geometry
+        return per_facet(stack).transmission(sample.cos_incidence, sample.sin_squared)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -310,7 +318,7 @@ class RoughSurface(AbstractSurface):
     ) -> Beams:
         if not self.way_out.both_ways:
             return self.illumination.beams(stack, geometry, parameters, around)
-        rays, irradiance = self.illumination.rays(geometry, around)
+        rays, irradiance = self.illumination.rays(geometry, parameters, around)
         each = per_ray(dict(parameters))
         passing = self.exit(each, rays.reversed(), per_ray(stack))
         power = irradiance * cos_degrees(rays.light_zenith) * passing.intensity
@@ -329,13 +337,19 @@ class RoughSurface(AbstractSurface):
             return stack.escape()
         # Azimuths a right angle apart see the same grooves from both sides of an axis of theirs.
         cosine, weight = (like(x, geometry.view_zenith) for x in squared_rule(HEMISPHERE_NODES))
-        turns = jnp.arange(0.0, 180.0, 180.0 / GROOVE_AZIMUTHS) if self.slopes.turned else [0.0]
-        zenith, azimuth = jnp.meshgrid(jnp.rad2deg(jnp.arccos(cosine)), jnp.asarray(turns))
-        some = per_ray(geometry.view_zenith) * 0.0
-        down, around = some + zenith.ravel(), some + azimuth.ravel()
+        count = GROOVE_AZIMUTHS if self.slopes.turned else 1
+        turns = jnp.arange(count, dtype=cosine.dtype) * (180.0 / count)
+        zenith, azimuth = jnp.meshgrid(jnp.rad2deg(jnp.arccos(cosine)), turns)
+        start = 0.0 * geometry.view_zenith
+        axes = self.slopes.ellipse(parameters, geometry).axes
+        if axes is not None:
+            # From the grooves, whatever azimuth counts from: a rule of so few is not exact.
+            start = geometry.view_azimuth + jnp.rad2deg(jnp.arctan2(axes.sin, axes.cos))
+        some = per_ray(start) * 0.0
+        down, around = some + zenith.ravel(), per_ray(start) + azimuth.ravel()
         views = Geometry(down, around, down, around)
         passing = self.exit(per_ray(dict(parameters)), views, per_ray(stack)).intensity
-        share = jnp.tile(2.0 * cosine * weight, len(turns)) / len(turns)
+        share = jnp.tile(2.0 * cosine * weight, count) / count
         more = jnp.sum(share * passing, axis=-1) - stack.hemispherical_transmission()
         return stack.escape() + more / parameters["refractive_index"] ** 2
 

@@ -159,7 +159,10 @@ def _scene_of(stated: Mapping[str, Any], where: str) -> str | Scene | Setup | No
         name: parse_value(text, known, f"{where}: scene.{name}", SceneError)
         for name, text in texts.items()
     }
-    scene = Scene(**parts)
+    try:
+        scene = Scene(**parts)
+    except SceneError as error:
+        raise error.within(f"{where}: scene") from None
     if setup is None:
         return scene
     scene = scene.perfectly_known if scene.perfectly_known == setup.scene else scene

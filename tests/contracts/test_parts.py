@@ -20,6 +20,7 @@ from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 
 SETTINGS: dict[type, tuple] = {
     pb.Disc: (5.0,),
+    pb.physics.SunAndSky: (0.05,),
     pb.physics.CoatStack: ((pb.ClearCoat(), pb.ThinFilm()),),
     pb.physics.AnisotropicSlopes: ("roughness_azimuth",),
     pb.physics.LinearPolarization: ("light_degree", "light_angle"),

@@ -8,11 +8,19 @@ from cases import each
 
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
-from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
+from polar_bayes.physics.illumination import Disc, PointSource, SunAndSky, UniformSky
 from polar_bayes.physics.microfacet import GGX, Beckmann
+from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.stack import Stack
-from polar_bayes.physics.surface import RoughSurface, SmoothSurface
+from polar_bayes.physics.subsurface import TurbidMedium
+from polar_bayes.physics.surface import (
+    AbstractExit,
+    RoughExit,
+    RoughPassage,
+    RoughSurface,
+    SmoothSurface,
+)
 
 DISTRIBUTIONS = each(
     ("code", "distribution"), [(0, Beckmann()), (1, GGX())], ids=["Beckmann", "GGX"]
@@ -146,3 +154,26 @@ def test_a_small_disc_is_a_point() -> None:
     solid_angle = 2.0 * np.pi * (1.0 - np.cos(np.deg2rad(0.1)))
     # The source's radiance is spread over its solid angle, so irradiance is cosine-weighted.
     np.testing.assert_allclose(disc / solid_angle, point, rtol=1e-4, atol=1e-9)
+
+
+@each("way_out", [RoughExit(), RoughPassage()])
+def test_sun_and_sky_light_surface_and_body_together(way_out: AbstractExit) -> None:
+    """Stokes vectors of both, of a body that asks where its light comes from."""
+    views = Geometry.from_degrees(
+        view_zenith=[0.0, 50.0, 80.0], view_azimuth=180.0, light_zenith=40.0, light_azimuth=20.0
+    )
+    material = {"roughness": 0.2, "subsurface_fraction": 0.4, "refractive_index": 1.5}
+    material |= {"absorption": 0.3, "sky_radiance": 0.07}
+    sun, sky, both = (
+        stokes_of(
+            Scene(
+                RoughSurface(GGX(), light, FacetQuadrature(3, 2), way_out=way_out),
+                TurbidMedium(0.5),
+                StokesMixing(),
+            ),
+            material,
+            views,
+        )
+        for light in (PointSource(), UniformSky(), SunAndSky("sky_radiance"))
+    )
+    np.testing.assert_allclose(both, sun + 0.07 * sky, rtol=1e-12)

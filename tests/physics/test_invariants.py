@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from polar_bayes.physics.coat import AbstractCoat, BackFace, ClearCoat, CoatStack, ThinFilm
 from polar_bayes.physics.dispersion import Cauchy, Sellmeier
+from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
 from polar_bayes.physics.instrument import (
@@ -38,12 +39,14 @@ from polar_bayes.physics.microfacet import (
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
 from polar_bayes.physics.phase_function import HenyeyGreenstein
 from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.second_passage import TwoFacetPassage
 from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian, Unpolarized
 from polar_bayes.physics.surface import InternalReflection, RoughSurface, SmoothExit, SmoothSurface
 
 BEAM = PointSource(LinearPolarization("light_degree", "light_angle"))
 GROOVED = AnisotropicSlopes("roughness_azimuth")
+FEW = FacetQuadrature(2, 2)
 
 # Every part occurs, and every kind of light meets every kind of surface.
 SCENES = {
@@ -55,7 +58,7 @@ SCENES = {
         Instrument((AngleZero(), BeamOverlap(), DolpGain(), DarkLevel(), Saturation(0.2))),
     ),
     "grooves under a sky, with a film": Scene(
-        RoughSurface(GGX(), UniformSky(), slopes=GROOVED),
+        RoughSurface(GGX(), UniformSky(), FEW, GROOVED, way_out=TwoFacetPassage()),
         Depolarizer(),
         DopMixing(signed=True),
         ThinFilm(),

@@ -11,7 +11,7 @@ from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
 from polar_bayes.physics.dispersion import Cauchy, Sellmeier
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
-from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
+from polar_bayes.physics.illumination import Disc, PointSource, SunAndSky, UniformSky
 from polar_bayes.physics.instrument import (
     Analyzer,
     AngleZero,
@@ -36,11 +36,13 @@ from polar_bayes.physics.mixing import DopMixing, StokesMixing
 from polar_bayes.physics.phase_function import HenyeyGreenstein
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, SCENES, Scene
 from polar_bayes.physics.second_bounce import TwoBounceSurface
+from polar_bayes.physics.second_passage import TwoFacetPassage
 from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian, TurbidMedium, Unpolarized
 from polar_bayes.physics.surface import (
     InternalReflection,
     RoughExit,
+    RoughPassage,
     RoughSurface,
     SmoothExit,
     SmoothSurface,
@@ -66,7 +68,7 @@ READ = [
     ),
     (
         Scene(  # the material's in their order, then the light, then the instrument
-            RoughSurface(GGX(), BEAM, slopes=GROOVED),
+            RoughSurface(GGX(), BEAM, slopes=GROOVED, way_out=RoughPassage()),
             Lambertian("albedo"),
             StokesMixing(),
             CoatStack((FILM, LACQUER)),
@@ -119,6 +121,8 @@ SIMPLER = [
     (SeparableShadowing(), ()),
     (RoughExit(), (SmoothExit(),)),
     (SmoothExit(), ()),
+    (TwoFacetPassage(), (RoughPassage(), RoughExit(), SmoothExit())),
+    (SunAndSky(0.05), (PointSource(), UniformSky())),
     (
         TwoBounceSurface(GGX()),
         (

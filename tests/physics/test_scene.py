@@ -28,7 +28,7 @@ from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import SCENES, Scene
 from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian
-from polar_bayes.physics.surface import RoughSurface, SmoothSurface
+from polar_bayes.physics.surface import RoughPassage, RoughSurface, SmoothSurface
 
 predict = jax.jit(Scene.predict, static_argnums=0)
 stokes_of = jax.jit(Scene.stokes, static_argnums=0)
@@ -174,6 +174,7 @@ EVERYTHING = Scene(
         GGX(),
         PointSource(LinearPolarization("light_degree", "light_angle")),
         slopes=AnisotropicSlopes("roughness_azimuth"),
+        way_out=RoughPassage(),
     ),
     Lambertian("albedo"),
     StokesMixing(),

@@ -25,6 +25,7 @@ ROUGH = pb.Scene(
         pb.Disc(5.0),
         slopes=pb.physics.AnisotropicSlopes(),
         shadowing=pb.physics.NoShadowing(),
+        way_out=pb.physics.RoughPassage(),
     ),
     subsurface=pb.Lambertian(internal_reflection=pb.physics.InternalReflection()),
     mixing=pb.StokesMixing(),
@@ -84,9 +85,10 @@ def test_every_replacement_of_every_part_is_an_effect() -> None:
         "AngleZero": "instrument.terms[0]",
         "DarkLevel": "instrument.terms[1]",
     }
-    # Light does not leave facets under a thin film as through a plane.
+    # Light does not enter a body under filmed facets as through a plane.
     bare = dataclasses.replace(ROUGH, coat=None)
-    assert "RoughExit -> SmoothExit" in {effect.name for effect in effects_of(bare)}
+    plane = {"RoughPassage -> RoughExit", "RoughPassage -> SmoothExit"}
+    assert plane <= {effect.name for effect in effects_of(bare)}
 
 
 def test_each_changes_one_part_and_leaves_the_rest() -> None:
@@ -127,7 +129,8 @@ def test_what_holds_nothing_any_more_is_left_out_too() -> None:
         (SETUPS["goniometer"].scene, ["water film", "thin film", "back face"]),
         # What scatters in a body, or on facets, is no transparent plate.
         (SETUPS["picture"].scene, ["water film", "thin film"]),
-        (SETUPS["camera"].scene, ["water film", "thin film"]),
+        # Light enters a body under filmed facets through facets only.
+        (SETUPS["camera"].scene, ["water film"]),
         (pb.Scene(pb.SmoothSurface(), coat=pb.ClearCoat()), ["back face"]),
         (pb.Scene(pb.SmoothSurface(back=pb.physics.BackFace())), ["water film", "thin film"]),
         (ROUGH, []),

@@ -71,6 +71,18 @@ WRONG = {
 }
 
 
+def test_parts_that_do_not_suit_each_other_are_refused_with_the_file(tmp_path: Path):
+    file = tmp_path / "filmed.toml"
+    parts = {"surface": "RoughSurface()", "subsurface": "Lambertian()", "mixing": "StokesMixing()"}
+    for wrong, where in (("ThinFilm(1.4, 100.0)", "way_out"), ("ThinFilm(0.5)", "coat: ThinFilm")):
+        texts = parts | {"coat": wrong}
+        file.write_text("[scene]\n" + "\n".join(f"{n} = '{x}'" for n, x in texts.items()))
+        with pytest.raises(pb.SceneError) as caught:
+            pb.load_scene(file)
+        separator = ": " if where == "way_out" else "."
+        assert str(caught.value).startswith(f"{file}: scene{separator}{where}: ")
+
+
 @each("text", WRONG)
 def test_a_mistake_in_a_file_gets_one_line(text, tmp_path: Path):
     file = tmp_path / "wrong.toml"
@@ -79,12 +91,15 @@ def test_a_mistake_in_a_file_gets_one_line(text, tmp_path: Path):
         pb.load_scene(file)
 
 
+FILMED = "Scene(RoughSurface(), Lambertian(), StokesMixing(), ThinFilm(1.4, 100.0))"
+
 OWN = {
     "stacked": ({"scene_parts": "0.50 x Scene(); 0.50 x Scene()"}, "it stacks several scenes"),
     "none": ({"scene_parts": None}, "it states no scene"),
     "model": ({"model": "mine"}, "a file cannot describe its model mine"),
     "part": ({"scene_parts": "Scene(surface=Mine())"}, "Mine is not known here"),
     "prior": ({"priors": {"albedo": "Mine()"}}, "priors.albedo: Mine is not known here"),
+    "film": ({"scene_parts": FILMED}, r"^scene: way_out: RoughExit\(\) with ThinFilm: .*RoughPass"),
 }
 
 
