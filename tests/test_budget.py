@@ -13,7 +13,7 @@ CODE = {
     "benchmark": 574,
     "calibration": 1037,
     "capture": 813,
-    "cli": 1251,
+    "cli": 1256,
     "design": 1085,
     "diagnostics": 1788,
     "importers": 2108,
@@ -22,18 +22,18 @@ CODE = {
     "methods": 1226,
     "numerics": 992,
     "observation": 499,
-    "physics": 2650,
+    "physics": 2740,
     "reporting": 3311,
-    "scenes": 1756,
-    "own files": 1568,
+    "scenes": 1759,
+    "own files": 1571,
     "models": 320,
-    "tests": 23886,
+    "tests": 24018,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25387,
-    "classes": 335,
+    "code": 25488,
+    "classes": 337,
     "constants": 417,
     "Any": 194,
     "longest function": 80,
