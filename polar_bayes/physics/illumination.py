@@ -19,7 +19,6 @@ from polar_bayes.physics.geometry import (
     per_ray,
     sin_degrees,
 )
-from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.part import (
     Parameters,
     Part,
@@ -27,6 +26,7 @@ from polar_bayes.physics.part import (
     Setting,
     check_part,
     like,
+    quotient,
     squared_rule,
     unit_rule,
     value_of,
@@ -383,7 +383,11 @@ class SunAndSky(AbstractIllumination):
         return sun._replace(light_zenith=zenith, light_azimuth=azimuth), irradiance
 
     def _both(self, sun: Light, sky: Light, parameters: Parameters) -> Light:
-        """Their Stokes vectors, of which the mixture is a share."""
-        radiance = value_of(self.sky_radiance, parameters)
-        light = StokesMixing().mix(radiance / (1.0 + radiance), sun, sky)
-        return light._replace(intensity=(1.0 + radiance) * light.intensity)
+        """The sum of their Stokes vectors."""
+        of_sky = value_of(self.sky_radiance, parameters) * sky.intensity
+        total = sun.intensity + of_sky
+        # Where neither sends light, the polarization is the sun's; a smaller floor would leave
+        # single precision in the Hessian.
+        share = quotient(of_sky, total + jnp.finfo(total.dtype).eps)
+        q, u = (one + share * (other - one) for one, other in ((sun.q, sky.q), (sun.u, sky.u)))
+        return Light(total, q, u)
