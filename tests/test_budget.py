@@ -22,7 +22,7 @@ CODE = {
     "methods": 1226,
     "numerics": 992,
     "observation": 499,
-    "physics": 2742,
+    "physics": 2747,
     "reporting": 3311,
     "scenes": 1759,
     "own files": 1571,
@@ -32,7 +32,7 @@ CODE = {
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25490,
+    "code": 25495,
     "classes": 337,
     "constants": 417,
     "Any": 194,

@@ -15,7 +15,7 @@ from polar_bayes.physics.coat import BackFace, ClearCoat, ThinFilm
 from polar_bayes.physics.part import Part
 from polar_bayes.physics.scene import Scene, UnsuitablePartsError
 from polar_bayes.physics.subsurface import Unpolarized
-from polar_bayes.physics.surface import SmoothSurface
+from polar_bayes.physics.surface import RoughPassage, RoughSurface, SmoothSurface
 
 WATER_FILM = ClearCoat(1.333, 0.0)
 """A film of water, as on a wet leaf, a puddle or a plate with dew."""
@@ -26,12 +26,21 @@ KeyPath = tuple[str | int, ...]
 
 @dataclasses.dataclass(frozen=True)
 class Effect:
-    """One part of a scene, or an empty place, and one replacement, simpler or alternative."""
+    """One part of a scene, or an empty place, and one replacement, simpler or alternative.
+
+    Args:
+        name: How it is called.
+        key_path: Where the part is.
+        part: What is there; None for nothing.
+        replacement: What takes its place; None for nothing.
+        needs: Replacements elsewhere, without which a scene refuses this one.
+    """
 
     name: str
     key_path: KeyPath
     part: Part | None
     replacement: Part | None
+    needs: tuple["Effect", ...] = ()
 
     @property
     def path(self) -> str:
@@ -40,7 +49,7 @@ class Effect:
 
     def apply(self, scene: Scene) -> Scene:
         """Return the scene without this effect; see `simplify`."""
-        return simplify(scene, [self])
+        return simplify(scene, [self, *self.needs])
 
 
 def effects_of(scene: Scene) -> tuple[Effect, ...]:
@@ -61,14 +70,21 @@ def unseen_layers(scene: Scene, *, has_wavelength: bool) -> tuple[Effect, ...]:
         # Of a thick film the outer interface is all that polarization shows: only one whose index
         # is known can be told from a body.
         found.append(Effect("water film", ("coat",), None, WATER_FILM))
-        film = Effect("thin film", ("coat",), None, ThinFilm())
-        if has_wavelength and _applied(film, scene) is not None:
-            found.append(film)
+        if has_wavelength:
+            found.append(Effect("thin film", ("coat",), None, ThinFilm(), _both_ways(scene)))
     # The body of a transparent plate scatters nothing; stray light may take its place.
     surface, is_clear = scene.surface, isinstance(scene.subsurface, Unpolarized | None)
     if isinstance(surface, SmoothSurface) and surface.back is None and is_clear:
         found.append(Effect("back face", ("surface", "back"), None, BackFace()))
     return tuple(found)
+
+
+def _both_ways(scene: Scene) -> tuple[Effect, ...]:
+    """Return what makes a body's light pass facets both ways, as it must under a thin film."""
+    way = scene.surface.way_out if isinstance(scene.surface, RoughSurface) else None
+    if way is None or way.both_ways or scene.subsurface is None:
+        return ()
+    return (Effect("facets both ways", ("surface", "way_out"), way, RoughPassage()),)
 
 
 def _replacements(

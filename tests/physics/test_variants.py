@@ -129,8 +129,7 @@ def test_what_holds_nothing_any_more_is_left_out_too() -> None:
         (SETUPS["goniometer"].scene, ["water film", "thin film", "back face"]),
         # What scatters in a body, or on facets, is no transparent plate.
         (SETUPS["picture"].scene, ["water film", "thin film"]),
-        # Light enters a body under filmed facets through facets only.
-        (SETUPS["camera"].scene, ["water film"]),
+        (SETUPS["camera"].scene, ["water film", "thin film"]),
         (pb.Scene(pb.SmoothSurface(), coat=pb.ClearCoat()), ["back face"]),
         (pb.Scene(pb.SmoothSurface(back=pb.physics.BackFace())), ["water film", "thin film"]),
         (ROUGH, []),
