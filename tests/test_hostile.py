@@ -17,6 +17,7 @@ def test_no_malformed_input_gets_a_traceback_or_passes_for_good() -> None:
     assert "1,000 cases, 0 bad" in done.stdout
 
 
+@pytest.mark.thorough
 def test_captures_tables_frames_and_options_are_refused_or_right() -> None:
     families = ["memory", "tables", "frames", "options"]
     words = [sys.executable, str(FUZZ), *families, "--share", "0.01", "--seed", "21"]

@@ -224,6 +224,7 @@ assert "jax" in sys.modules and "rich" in sys.modules
 """
 
 
+@pytest.mark.thorough
 def test_importing_every_name_draws_nothing_starts_no_thread_and_filters_no_warning():
     """JAX and Rich draw from the global states of NumPy and Python when they are imported."""
     assert run(EVERY_NAME) == ""

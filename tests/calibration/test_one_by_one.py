@@ -157,6 +157,7 @@ def problem_of(capture: xr.Dataset) -> Problem:
     return Problem(compile_model(request, data), data, jax.random.key(1))
 
 
+@pytest.mark.thorough
 def test_a_fit_is_that_of_the_public_verb(capture: xr.Dataset) -> None:
     """The same posterior: mean and spread against the closed form."""
     settings, here = pb.methods.Laplace(draws=4000, chains=1), problem_of(capture)

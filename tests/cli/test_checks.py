@@ -12,6 +12,7 @@ from polar_bayes.cli.captures import SCALES
 from polar_bayes.importers.mirror import ANGLE_IS
 
 
+@pytest.mark.thorough
 def test_calibrate_prints_a_table_and_writes_every_fit(plate, plate_scene, tmp_path, capsys):
     out = tmp_path / "sbc.nc"
     words = ["calibrate", str(plate), "--simulations", "20", "--method", "laplace"]

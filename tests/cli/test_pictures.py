@@ -108,7 +108,7 @@ def rim() -> np.ndarray:
         ([*SPHERE], "give one of --light, --light-position, --highlight, --surroundings"),
         ([*SPHERE, *LIGHT, "--surroundings"], "give one of --light"),
         ([*SPHERE, *LIGHT, "--dark", __file__, "--dark-level", "3"], "exclude each other"),
-        ([*SPHERE, *LIGHT], "saturation_level: the frames do not say"),
+        ([*SPHERE, *LIGHT], "--saturation-level: the frames do not say"),
         ([*SPHERE, *LIGHT, *FULL, "--dark", "none.npy"], "none.npy: there is no such file"),
         ([*SPHERE, "--highlight", "0", "0", *FULL], "there is no surface"),
         ([*SPHERE, *LIGHT, *FULL, "--transfer", "rec709"], "transfer: it is 'rec709'"),

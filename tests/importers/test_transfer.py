@@ -174,6 +174,7 @@ def picture(seed, transfer=None, **asked) -> xr.Dataset:
     return pb.from_polarizer(list(scene(seed, **asked)[0]), FOUR, detector=detector, **KNOWN)
 
 
+@pytest.mark.thorough
 @each("asked", [{}, {"shift": 1}, {"passed": (1.0, 0.8, 1.1, 0.9)}], ids=str)
 def test_linear_frames_are_not_cautioned(asked: dict):
     """No alarm in 10 scenes each, which excludes rates above 26% at a level of 95%."""

@@ -106,6 +106,7 @@ def test_what_cannot_be_held_is_refused() -> None:
         here.hold({"level": [0.0, 1.0]})
 
 
+@pytest.mark.thorough
 def test_a_capture_of_a_layout_that_was_fitted_side_by_side_is_fitted_alone() -> None:
     """Both share programs, whatever is held."""
     one = capture(seed=1)

@@ -382,6 +382,7 @@ def test_what_is_edited_in_a_notebook_is_another_scene_to_simulate_and_to_fit() 
     assert type(body).light.__globals__ is cells
 
 
+@pytest.mark.thorough
 def test_a_link_that_holds_an_array_simulates() -> None:
     @dataclasses.dataclass(frozen=True)
     class Tabled(pb.links.BetaLink):

@@ -75,6 +75,7 @@ def index_above_one(data, scene, priors, links):
     declare_readings(parameters, data, scene, priors, links)
 
 
+@pytest.mark.thorough
 def test_a_model_reads_priors_by_any_name(capture: xr.Dataset) -> None:
     own = {"excess": dist.LogNormal(-0.7, 0.2)}
     result = fit(capture, model=index_above_one, priors=own)

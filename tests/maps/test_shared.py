@@ -88,6 +88,7 @@ def test_it_does_not_matter_how_the_image_is_cut(image, maps, tmp_path):
     assert "What all pixels have in common" in page
 
 
+@pytest.mark.thorough
 def test_masked_pixels_say_nothing_about_what_is_shared(image: xr.Dataset) -> None:
     holes = image.assign(q=image["q"].where((image["y"] % 2 == 0) | (image["x"] % 3 > 0)))
     maps = pb.fit_pixels(holes, scene=PLATE, links=LINKS, shared=SHARED)

@@ -116,6 +116,7 @@ def test_weights_that_do_not_reach_all_of_a_posterior_are_a_problem():
     assert any("Pareto k" in problem for problem in found.problems)
 
 
+@pytest.mark.thorough
 def test_further_rounds_follow_a_posterior_that_is_not_normal():
     here, seeds = problem(funnel), range(4)
     once, found = (

@@ -38,6 +38,7 @@ def target(size: int, chains: int) -> Target:
     )
 
 
+@pytest.mark.thorough
 def test_how_draws_are_cut_into_blocks_changes_nothing() -> None:
     """A warm-up that ends inside a block, too: its steps are counted, its draws are not kept."""
     told = []

@@ -336,7 +336,7 @@ def make_sensor(parameter):
     return SensorStudentT(5.0, 0.5 * parameter, 0.05, False, jnp.inf)
 
 
-MAKERS = each("make", [make_beta, make_sensor])
+MAKERS = each("make", [make_beta, make_sensor], quick=1)
 
 
 @MAKERS

@@ -51,6 +51,7 @@ def test_exit_agrees_with_the_transfer_matrix(fresnel_curves: np.ndarray) -> Non
     np.testing.assert_allclose(-difference / mean, stable, rtol=1e-9, atol=1e-15)
 
 
+@pytest.mark.thorough
 @each("n", [1.000001, 1.0001, 1.01, 1.2, 1.5, 2.0, 3.0])
 def test_hemisphere_with_slope_and_curvature(n: float) -> None:
     """Escape against the closed form in 40 digits, with both derivatives.

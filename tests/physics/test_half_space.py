@@ -292,6 +292,7 @@ def test_a_black_body_scatters_once(
     np.testing.assert_allclose(found, expected, atol=1e-6 * expected[0, 0])
 
 
+@pytest.mark.thorough
 def test_absorption_has_a_floor_and_nothing_may_be_turned_back() -> None:
     rays = [jnp.array([0.7]), jnp.array([0.7])]
     entering = tuple(jnp.array([x]) for x in (0.9, 0.1, 0.0))

@@ -156,7 +156,7 @@ def test_a_small_disc_is_a_point() -> None:
     np.testing.assert_allclose(disc / solid_angle, point, rtol=1e-4, atol=1e-9)
 
 
-@each("way_out", [RoughExit(), RoughPassage()])
+@each("way_out", [RoughExit(), RoughPassage()], quick=1)
 def test_sun_and_sky_light_surface_and_body_together(way_out: AbstractExit) -> None:
     """Stokes vectors of both, of a body that asks where its light comes from."""
     views = Geometry.from_degrees(

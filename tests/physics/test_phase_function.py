@@ -179,6 +179,7 @@ def test_forward_scattering_agrees_with_adding_doubling() -> None:
         np.testing.assert_allclose(found, normal - ((n - 1.0) / (n + 1.0)) ** 2, rtol=bound)
 
 
+@pytest.mark.thorough
 def test_forward_scattering_agrees_with_photons() -> None:
     """Off the plane of the light, too: every collision sends what the viewer sees of it.
 

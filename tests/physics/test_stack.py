@@ -188,6 +188,7 @@ def test_escape_through_two_coats_agrees_with_brute_force(indexes: list, bound: 
     np.testing.assert_allclose(escape(thick(indexes, [0.2, 0.3])), truth, rtol=bound)
 
 
+@pytest.mark.thorough
 @given(body=index, coat=index)
 @RUN
 def test_as_much_diffuse_light_enters_as_leaves(body: float, coat: float) -> None:
@@ -198,6 +199,7 @@ def test_as_much_diffuse_light_enters_as_leaves(body: float, coat: float) -> Non
         np.testing.assert_allclose(body**2 * escape(stack), entering, rtol=1e-8)
 
 
+@pytest.mark.thorough
 @each(("thickness", "bound"), [(230.0, 1e-12), (3000.0, 1e-9), (1e4, 2e-4)])
 def test_fringes_over_the_hemisphere_have_enough_nodes(thickness: float, bound: float) -> None:
     """Films of several indices against 800 nodes; too few make a body return what it never got."""

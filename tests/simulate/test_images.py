@@ -196,6 +196,7 @@ def test_a_shadow_is_noisier_in_dop():
     assert np.all(capture["intensity"].isel(x=1).mean("y") < 0.1)
 
 
+@pytest.mark.thorough
 def test_a_highlight_is_saturated_and_said_to_be():
     light = np.full((ROWS, COLUMNS), 0.1)
     light[1, 2] = 1e3

@@ -39,7 +39,7 @@ default_capture = functools.cache(simulate)
 # --- every material, every set-up -----------------------------------------------------------------
 
 
-@each("setup", ["paper", "goniometer"])
+@each("setup", ["goniometer", "paper"], quick=1)
 def test_the_leaf_is_a_valid_capture(setup):
     check_capture("leaf", setup)
 
