@@ -15,7 +15,7 @@ CODE = {
     "capture": 813,
     "cli": 1256,
     "design": 1085,
-    "diagnostics": 1788,
+    "diagnostics": 1790,
     "importers": 2108,
     "inference": 2695,
     "maps": 1714,
@@ -32,7 +32,7 @@ CODE = {
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25495,
+    "code": 25497,
     "classes": 337,
     "constants": 417,
     "Any": 194,

@@ -463,14 +463,16 @@ def _alternatives(fit: FitView, absent: Sequence[Scalar]) -> Finding:
         # What a smooth error has stood in for without harm to the answer only widens it.
         stands_in = part == NOTHING and not moves.any()
         return judged_by(p_value, highest, sentence, most="caution" if stands_in else "problem")
-    # Under a layer that is as likely as none the index is not that of the body.
+    # Under a layer that is as likely as none, to a bare mention, the index is not that of the body.
     layer, factor = table["part"] == NOTHING, table["log_bayes_factor"]
-    hidden = layer & table.index.str.startswith(INDEX) & (factor > 0.0)
+    hidden = layer & table.index.str.startswith(INDEX) & (factor > -LIMITS.favored)
     favored = factor > LIMITS.favored
     weighty = table["moves"] & (favored | hidden)
     undecided = table[(table["moves"] & (factor > LIMITS.refuted)) | (layer & favored)]
     if undecided.empty:
         return Finding("passed", p_value, highest)
+    if undecided["moves"].any():  # what stays is no other answer
+        undecided = undecided[undecided["moves"]]
     answers = [
         f"{label} is {row['other']:.3g}, {abs(row['shift']):.1f} sd away, with "
         + _swap_text(row["alternative"], row["part"])
