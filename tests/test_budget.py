@@ -38,7 +38,13 @@ WHOLE = {
     "Any": 194,
     "longest function": 80,
 }
-"""Limits of the whole package; the limit of `longest function` is in lines."""
+"""Limits of the whole package; the limit of `longest function` is in lines.
+
+The plan was 20,500 lines of code, 290 classes and 180 `Any`, for a package that had 23,938 lines.
+Since then features came that were chosen over it: readers of other people's files (900 lines),
+the set-up in the interval (210), a map to point at (290), second bounces and passages (220) and
+programs on the disk (90). The other rooms became smaller by a few lines only.
+"""
 
 
 def lines_of(nodes: list[ast.AST]) -> set[int]:
