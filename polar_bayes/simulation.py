@@ -387,9 +387,12 @@ def _recorder(
     leaves, tree = jax.tree.flatten(given)
     shapes = str(tree), *map(np.shape, leaves)
     key = fingerprint(scene, links, image, *shapes, code=(scene, links))
-    kept = "" if uses_own_code(scene, links) else f"readings of {key}"
-    record = functools.partial(_record, scene, links, image)
-    return _RECORDERS.of(key, lambda: JitOnce(record, kept))
+
+    def made() -> JitOnce:
+        kept = "" if uses_own_code(scene, links) else f"readings of {key}"
+        return JitOnce(functools.partial(_record, scene, links, image), kept)
+
+    return _RECORDERS.of(key, made)
 
 
 def _record(

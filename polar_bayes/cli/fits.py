@@ -274,14 +274,13 @@ def scene(source: Path | str, out: Path | None) -> None:
     """Write the scene, links, priors and method of a result as a file that --scene takes."""
     found = source if isinstance(source, str) else pb.load(source)
     try:
-        text = pb.scenes.scene_text(found)
-    except pb.PolarBayesError as error:
+        if out is None:
+            click.echo(pb.scenes.scene_text(found), nl=False)
+        else:
+            pb.save_scene(found, out)
+            click.echo(f"{out}: edit it, and give it as --scene {out}")
+    except (pb.SceneError, pb.FitError) as error:  # of the result, not of the file that is written
         raise error.within(str(source)) from None
-    if out is None:
-        click.echo(text, nl=False)
-    else:
-        pb.save_scene(found, out)
-        click.echo(f"{out}: edit it, and give it as --scene {out}")
 
 
 @command()

@@ -356,12 +356,16 @@ def next_views_table(found: xr.Dataset) -> pd.DataFrame:
     return table
 
 
+SMALL_GAIN = 0.1
+"""Share by which further views narrow an interval, below which they hardly help."""
+
+
 def next_views_sentences(found: xr.Dataset) -> list[str]:
     """State which views to take next, and by how much which intervals narrow."""
     widths = found["interval_width"].transpose("step", "parameter")
     before, after = widths.isel(step=0).to_numpy(), widths.isel(step=-1).to_numpy()
     names = found["parameter"].to_numpy()
-    helped = after < 0.9 * before
+    helped = after < (1.0 - SMALL_GAIN) * before
     sentences = [f"Look next at {'; then at '.join(_view_texts(found))}."]
     sentences += [
         f"The 95% interval of {name} is expected to narrow from {old:.3g} to {new:.3g}."
@@ -369,10 +373,10 @@ def next_views_sentences(found: xr.Dataset) -> list[str]:
     ]
     if not helped.all():
         sentences.append(f"These views hardly help {', '.join(names[~helped])}.")
-    return [*sentences, *_limits_sentences(found)]
+    return [*sentences, *limits_sentences(found)]
 
 
-def _limits_sentences(found: xr.Dataset) -> list[str]:
+def limits_sentences(found: xr.Dataset) -> list[str]:
     """State the limits within which views were chosen, and how to narrow them."""
     if "limits" not in (about := provenance_of(found)):
         return []

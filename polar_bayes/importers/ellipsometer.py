@@ -42,7 +42,7 @@ from polar_bayes.importers.columns import Table, counted, read_table
 from polar_bayes.importers.mirror import as_incidence, mirror_views
 from polar_bayes.importers.table import MUELLER, capture_of_lines
 
-PSI_ERROR, DELTA_ERROR, ELEMENT_ERROR = 0.1, 0.2, 0.005
+ASSUMED_ERRORS, ELEMENT_ERROR = {"psi": 0.1, "delta": 0.2}, 0.005
 """Default errors of psi and delta in degrees, and of an element of a Mueller matrix."""
 TO_NM = {"nm": 1.0, "angstroms": 0.1, "angstrom": 0.1, "um": 1000.0, "µm": 1000.0}
 WVASE = ("wavelength", "angle", "psi", "delta", "psi_error", "delta_error")
@@ -113,6 +113,8 @@ def from_ellipsometer(
         read = _read_named(table, given, mueller, sheet)
     values = {key: _grid(read, key, each) for key, each in given.items() if each is not None}
     incidence = _incidence(read, values, angle_is)
+    in_use = [key for key in ASSUMED_ERRORS if key in values]
+    is_assumed = mueller is not None or any(f"{key}_error" not in values for key in in_use)
     notes = [*read.notes, *([f"the angles were read as {angle_is}"] if angle_is else [])]
     if mueller is None:
         _check_angles(read, values, unit)
@@ -126,7 +128,7 @@ def from_ellipsometer(
         source=Path(table).name,
         setup="goniometer",
         angle_set_by=angle_set_by,
-        **({"errors": ASSUMED} if any("was assumed" in note for note in notes) else {}),
+        **({"errors": ASSUMED} if is_assumed else {}),
         **({"import_notes": "; ".join(notes)} if notes else {}),
     )
     return validate(capture, source=capture.attrs["name"])
@@ -248,14 +250,13 @@ def _of_angles(
     values: Mapping[str, np.ndarray], to_degrees: float, notes: list[str]
 ) -> dict[str, np.ndarray]:
     """Return Stokes parameters from psi and delta."""
-    assumed = {"psi": PSI_ERROR, "delta": DELTA_ERROR}
     radians, errors = {}, {}
-    for key in (key for key in assumed if key in values):
+    for key in (key for key in ASSUMED_ERRORS if key in values):
         radians[key] = np.deg2rad(to_degrees * values[key])
         stated = values.get(f"{key}_error")
         if stated is None:
-            notes.append(f"an error of {assumed[key]:g} degrees of {key} was assumed")
-        known = np.full((1, 1), assumed[key]) if stated is None else to_degrees * stated
+            notes.append(f"an error of {ASSUMED_ERRORS[key]:g} degrees of {key} was assumed")
+        known = np.full((1, 1), ASSUMED_ERRORS[key]) if stated is None else to_degrees * stated
         errors[key] = np.deg2rad(known)
     sin, cos = np.sin(2.0 * radians["psi"]), np.cos(2.0 * radians["psi"])
     psi = errors["psi"] * (math.sqrt(2.0) if "delta" in values else 1.0)

@@ -19,14 +19,10 @@ from typing import Any
 import cachetools
 import jax
 from jax.experimental.compilation_cache import compilation_cache
+from jax.stages import Compiled, Lowered
 
 from polar_bayes.errors import FitError
-from polar_bayes.numerics.kept_programs import (
-    KeptProgram,
-    cache_hits,
-    kept_program,
-    of_this_version,
-)
+from polar_bayes.numerics.kept_programs import KeptProgram, cache_hits, kept_program
 from polar_bayes.paths import compiled_folder, make_private
 from polar_bayes.progress import Progress
 
@@ -111,7 +107,8 @@ class JitOnce:
 
     def __init__(self, function: Callable, key: str = "") -> None:
         self.key = key
-        self._function = compiled(of_this_version(function) if key else function)
+        self._function = function
+        keep_compiled_programs()
         self._compilations: dict[Hashable, _Compilation] = {}
 
     @property
@@ -138,24 +135,27 @@ class JitOnce:
             key = self._key(arguments)
             if key not in self._compilations:
                 kept = kept_program(self.key, arguments)
+                function = self._function if kept is None else kept.named(self._function)
+                lower = functools.partial(compiled(function).lower, *arguments)
                 if kept is None or not kept.exists:
-                    compile_now = self._function.lower(*arguments).compile
+                    compile_now = lower().compile
                 else:
                     double = jax.config.jax_enable_x64
-                    compile_now = functools.partial(self._trace_and_compile, arguments, double)
+                    compile_now = functools.partial(_trace_and_compile, lower, double)
                 self._compilations[key] = _Compilation(compile_now, kept)
             return self._compilations[key]
-
-    def _trace_and_compile(self, arguments: tuple, double: bool) -> Any:
-        """Make the program in a thread that finds the kept one damaged."""
-        with TRACING_LOCK, jax.enable_x64(double):
-            lowered = self._function.lower(*arguments)
-        return lowered.compile()
 
     @staticmethod
     def _key(arguments: tuple) -> Hashable:
         shape = getattr(arguments[0], "shape", None)
         return shape, jax.config.jax_default_device  # a compiled program runs on one device
+
+
+def _trace_and_compile(lower: Callable[[], Lowered], double: bool) -> Compiled:
+    """Make a program in a thread that finds the kept one damaged."""
+    with TRACING_LOCK, jax.enable_x64(double):
+        lowered = lower()
+    return lowered.compile()
 
 
 class _Compilation:
@@ -185,7 +185,7 @@ class _Compilation:
             return found
         hits = cache_hits()
         found = compile_now()
-        # XLA cannot write a program again that JAX's own cache has read; see `of_this_version`.
+        # XLA cannot write a program again that JAX's own cache has read; see `KeptProgram.named`.
         if self._kept is not None and cache_hits() == hits:
             _COMPILER_THREAD.submit(self._kept.save, found)
         return found

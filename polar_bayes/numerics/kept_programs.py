@@ -65,6 +65,20 @@ class KeptProgram:
         """Whether there is something to load."""
         return self._path.is_file()
 
+    def named(self, function: Callable) -> Callable:
+        """The function by a name of this program alone.
+
+        JAX's own cache tells programs apart by name, too. So it has none of another version, which
+        could be run but not kept.
+        """
+
+        def run(*arguments: Any) -> Any:
+            return function(*arguments)
+
+        name, own = getattr(function, "__name__", "run"), (self._path.parent.name, self._path.name)
+        run.__name__ = "_".join([name, *(each[:8] for each in own)])
+        return run
+
     def load(self) -> Callable | None:
         """The program; None where it is damaged, or gone by now."""
         try:
@@ -107,20 +121,6 @@ def kept_program(key: str, arguments: tuple) -> KeptProgram | None:
     leaves, tree = jax.tree.flatten(arguments)
     words = [key, str(tree), *map(_described, leaves), str(config.jax_enable_x64)]
     return KeptProgram(folder / "programs" / environment / _digest(words), arguments)
-
-
-def of_this_version(function: Callable) -> Callable:
-    """The function by a name that no other version of what a program depends on gives it.
-
-    JAX's own cache tells programs apart by name, too, so that it has none of another version, which
-    could be run but not kept.
-    """
-
-    def run(*arguments: Any) -> Any:
-        return function(*arguments)
-
-    run.__name__ = f"{getattr(function, '__name__', 'run')}_{_environment()[:8]}"
-    return run
 
 
 def _described(leaf: Any) -> str:

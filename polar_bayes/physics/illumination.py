@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 import math
-from typing import Annotated, override
+from typing import Annotated, ClassVar, override
 
 import jax.numpy as jnp
 import numpy as np
@@ -341,26 +341,25 @@ class SunAndSky(AbstractIllumination):
     """
 
     sky_radiance: Annotated[Setting, Range(0.0, 1e3)]
+    _sources: ClassVar[tuple[AbstractIllumination, AbstractIllumination]] = (
+        PointSource(),
+        UniformSky(),
+    )
 
     @override
     def simpler(self) -> tuple[Part | None, ...]:
-        return (PointSource(), UniformSky())
+        return self._sources
 
     @override
     def reflect(
         self, facets: Microsurface, stack: Stack, geometry: Geometry, parameters: Parameters
     ) -> Light:
-        sun, sky = (
-            source.reflect(facets, stack, geometry, parameters)
-            for source in (PointSource(), UniformSky())
-        )
+        sun, sky = (source.reflect(facets, stack, geometry, parameters) for source in self._sources)
         return self._both(sun, sky, parameters)
 
     @override
     def entering(self, stack: Stack, geometry: Geometry, parameters: Parameters) -> Light:
-        sun, sky = (
-            source.entering(stack, geometry, parameters) for source in (PointSource(), UniformSky())
-        )
+        sun, sky = (source.entering(stack, geometry, parameters) for source in self._sources)
         return self._both(sun, sky, parameters)
 
     @override
@@ -368,7 +367,7 @@ class SunAndSky(AbstractIllumination):
         self, geometry: Geometry, parameters: Parameters, around: Turns = FOUR_TURNS
     ) -> tuple[Geometry, Array]:
         (sun, beam), (sky, radiance) = (
-            source.rays(geometry, parameters, around) for source in (PointSource(), UniformSky())
+            source.rays(geometry, parameters, around) for source in self._sources
         )
         radiance = per_ray(value_of(self.sky_radiance, parameters)) * radiance
         views = jnp.broadcast_shapes(*(x.shape[:-1] for x in (beam, sky.light_azimuth, radiance)))

@@ -15,6 +15,7 @@ import xarray as xr
 from polar_bayes.benchmark.advice import Study, accuracy_view
 from polar_bayes.calibration.scores import is_calibrated, p_values, significance_level
 from polar_bayes.calibration.verdict import CalibrationView, calibration_verdict
+from polar_bayes.design.next_views import SMALL_GAIN, limits_sentences
 from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.budget import better_known, budget, wider_by_setup
 from polar_bayes.diagnostics.compare import FitComparison
@@ -317,10 +318,6 @@ def index_sentences(fit: FitView) -> list[str]:
     return [f"The refractive index n is {join(phrases)}."]
 
 
-SMALL_GAIN = 0.1
-"""Share by which further views narrow an interval, below which they hardly help."""
-
-
 def next_sentence(result: xr.DataTree) -> str:
     """State what to measure next, if the result holds `polar_bayes.next_views`."""
     if "next_views" not in result.children:
@@ -329,9 +326,8 @@ def next_sentence(result: xr.DataTree) -> str:
             "result['next_views'] = pb.next_views(result)."
         )
     found = result["next_views"].to_dataset()
-    first, *others = verdict(found).sentences
-    views = first.rstrip(".").replace("Look next", "Measure next")
-    limits = "".join(f" {each}" for each in others if each.startswith("Candidates"))
+    views = verdict(found).sentences[0].rstrip(".").replace("Look next", "Measure next")
+    limits = "".join(f" {each}" for each in limits_sentences(found))
     widths = found["interval_width"].transpose("step", "parameter").to_pandas()
     of_index = widths.filter(like="refractive_index")
     before, after = (of_index if of_index.size else widths).iloc[[0, -1]].to_numpy()

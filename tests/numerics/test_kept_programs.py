@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -10,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from polar_bayes.numerics.compile import JitOnce, compiled
 from polar_bayes.numerics.kept_programs import kept_program
 from polar_bayes.paths import compiled_folder
 
@@ -58,18 +61,42 @@ def programs(cache: Path) -> list[Path]:
     return [path for path in cache.rglob("compiled/programs/*/*") if path.is_file()]
 
 
-def test_a_program_is_found_by_its_key_and_its_arguments(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def kept_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Programs are kept in this folder, as by a command."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    x, before = jnp.arange(3.0), jax.config.jax_compilation_cache_dir
+    before = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", str(compiled_folder()))
-    try:
-        kept, other, longer = (
-            kept_program(key, (given,)) for key, given in (("a", x), ("b", x), ("a", jnp.ones(4)))
-        )
-    finally:
-        jax.config.update("jax_compilation_cache_dir", before)
+    yield
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+def test_a_program_that_another_version_left_in_the_cache_of_jax_is_kept(
+    tmp_path: Path, kept_here: None
+) -> None:
+    """Whether its key comes with its function or later, as of a compiled model."""
+
+    def shifted(x: jax.Array) -> jax.Array:
+        return jnp.cos(x) + 0.456
+
+    x = jnp.arange(3.0)
+    compiled(shifted)(x)
+    first, later = JitOnce(shifted, "first"), JitOnce(shifted)
+    later.key = "later"
+    for count, program in enumerate((first, later), 1):
+        np.testing.assert_allclose(program(x), np.cos(x) + 0.456, rtol=1e-14)
+        jax.clear_caches()
+        for _ in range(100):  # it is written by another thread
+            if len(programs(tmp_path)) < count:
+                time.sleep(0.05)
+        assert len(programs(tmp_path)) == count
+
+
+def test_a_program_is_found_by_its_key_and_its_arguments(tmp_path: Path, kept_here: None) -> None:
+    x = jnp.arange(3.0)
+    kept, other, longer = (
+        kept_program(key, (given,)) for key, given in (("a", x), ("b", x), ("a", jnp.ones(4)))
+    )
     kept.save(jax.jit(lambda x: jnp.sin(x) + 0.123).lower(x).compile())
     assert len(programs(tmp_path)) == 1
     assert (kept.exists, other.exists, longer.exists) == (True, False, False)
