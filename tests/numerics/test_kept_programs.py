@@ -23,9 +23,9 @@ import numpy as np
 import polar_bayes as pb
 from compilations import compilations
 
-capture = pb.simulate("glass", scene="goniometer", protocol=pb.simulation.Protocol(views=9), seed=2)
-priors = {"leakage": pb.priors.HalfNormal(float(sys.argv[1]))}
-with compilations() as compiled:
+few, priors = pb.simulation.Protocol(views=9), {"leakage": pb.priors.HalfNormal(float(sys.argv[1]))}
+with compilations() as compiled:  # the simulation's program is kept, too
+    capture = pb.simulate("glass", scene="goniometer", protocol=few, seed=2)
     result = pb.fit(capture.isel(wavelength=0), priors=priors, method="laplace", seed=0)
 print(len(compiled), repr(float(pb.summary(result).loc["refractive_index", "mean"])))
 """
@@ -42,7 +42,7 @@ def run(cache: Path, leakage: float = 0.01, **variables: str) -> subprocess.Comp
 
 
 def fitted(cache: Path, leakage: float = 0.01) -> tuple[int, float]:
-    """How many programs a new process traces and compiles for a fit, and the answer."""
+    """How many programs a new process compiles for a simulation and a fit, and the answer."""
     count, answer = run(cache, leakage).stdout.split()
     return int(count), float(answer)
 
