@@ -34,7 +34,7 @@ from polar_bayes.models.sites import (
 )
 from polar_bayes.observation.data import Observations
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
-from polar_bayes.priors import RANGES, support_bounds
+from polar_bayes.priors import natural_scale, support_bounds
 from polar_bayes.repr_html import HTMLRepr
 
 
@@ -47,12 +47,12 @@ class Scale(NamedTuple):
     """Function from the coordinate of a member to the parameter in its own unit."""
 
 
-def natural_scale(name: str, location: dist.Distribution) -> Scale:
-    """Return the scale of a parameter by its physical range: log, log odds or identity."""
-    limits = RANGES.get(name, (-math.inf, math.inf))
-    if limits == (0.0, math.inf):
+def scale_of(name: str, location: dist.Distribution) -> Scale:
+    """Return the natural scale of a parameter; an index is truncated where its prior ends."""
+    natural = natural_scale(name)
+    if natural == "log":
         return Scale(lambda center, spread: dist.Normal(jnp.log(center), spread), jnp.exp)
-    if limits == (0.0, 1.0):
+    if natural == "log odds":
         return Scale(
             lambda center, spread: dist.Normal(jnp.log(center) - jnp.log1p(-center), spread),
             jax.nn.sigmoid,
@@ -86,7 +86,7 @@ def draw_pooled(
     with over_axes(data, without=(*leading, *without)):
         location = numpyro.sample(f"{name}_location", priors[f"{name}_location"])
     spread = numpyro.sample(f"{name}_spread", priors[f"{name}_spread"])
-    scale = natural_scale(name, priors[f"{name}_location"])
+    scale = scale_of(name, priors[f"{name}_location"])
     with over_axes(data, without=without):
         population = scale.population(location, spread)
         coordinate = numpyro.sample(f"{name}_base", population, infer={"auxiliary": True})

@@ -24,7 +24,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import NoReturn, override
+from typing import Literal, NoReturn, override
 
 import jax
 import jax.numpy as jnp
@@ -568,6 +568,12 @@ RANGES: dict[str, tuple[float, float]] = {
     "beam_overlap_zenith": (0.0, 90.0),
 }
 """Physical ranges of parameters with bounded priors; other parameters may take any value."""
+
+
+def natural_scale(name: str) -> Literal["log", "log odds", "plain"]:
+    """Return the scale on which a population of a parameter is normal, by its physical range."""
+    limits = RANGES.get(name, (-math.inf, math.inf))
+    return "log" if limits == (0.0, math.inf) else "log odds" if limits == (0.0, 1.0) else "plain"
 
 
 # --- Resolution and validation --------------------------------------------------------------------

@@ -15,6 +15,7 @@ import pandas as pd
 import xarray as xr
 from numpyro import distributions as dist
 
+from polar_bayes.capture.plausibility import at_mirror
 from polar_bayes.errors import FitError, SceneError
 from polar_bayes.frames import PrintedFrame
 from polar_bayes.observation.links import AbstractLink, BetaLink, StokesLink, StudentTLink
@@ -152,11 +153,7 @@ def as_read(setup: Setup, capture: xr.Dataset) -> Setup:
 
 def is_mirrored(capture: xr.Dataset) -> bool:
     """Whether every view is in the mirror direction of the light."""
-    zenith = np.abs(capture["view_zenith"] - capture["light_zenith"])
-    around = np.abs((capture["view_azimuth"] - capture["light_azimuth"]) % 360.0 - 180.0)
-    sideways = around * np.sin(np.radians(capture["view_zenith"]))
-    degree = 0.5  # from the mirror direction of the light, at most
-    return bool((zenith <= degree).all() and (sideways <= degree).all())
+    return bool(at_mirror(capture, within=0.5).all())
 
 
 def _at_mirror_angles(setup: Setup) -> Setup:

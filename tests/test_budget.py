@@ -11,30 +11,30 @@ ROOT = Path(__file__).parents[1]
 
 CODE = {
     "benchmark": 574,
-    "calibration": 1037,
-    "capture": 813,
+    "calibration": 1035,
+    "capture": 814,
     "cli": 1255,
     "design": 1086,
-    "diagnostics": 1790,
+    "diagnostics": 1786,
     "importers": 2109,
-    "inference": 2695,
-    "maps": 1714,
+    "inference": 2708,
+    "maps": 1709,
     "methods": 1226,
-    "numerics": 996,
+    "numerics": 993,
     "observation": 499,
     "physics": 2746,
-    "reporting": 3309,
+    "reporting": 3310,
     "scenes": 1759,
-    "own files": 1572,
+    "own files": 1571,
     "models": 320,
-    "tests": 24052,
+    "tests": 24056,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
     "code": 25500,
     "classes": 337,
-    "constants": 417,
+    "constants": 418,
     "Any": 193,
     "longest function": 80,
 }

@@ -28,7 +28,7 @@ from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.problem_batch import SMALL_BATCH, ProblemBatch
 from polar_bayes.inference.program import Program, Values
 from polar_bayes.numerics.compile import JitOnce
-from polar_bayes.numerics.psis import draws_at, smooth
+from polar_bayes.numerics.psis import smooth, systematic_resample
 from polar_bayes.observation.data import Observations
 
 Arrays = dict[str, np.ndarray]
@@ -70,7 +70,8 @@ class PredictivePit:
         """Fill in the fits at some positions from their weighted draws."""
         if not at.size:
             return
-        chosen = _resample(weights, self._first[at])
+        firsts = zip(weights, self._first[at], strict=True)
+        chosen = np.stack([systematic_resample(own, DRAWS, first) for own, first in firsts])
         rows = np.arange(at.size)[:, None]
         latent = {
             name: np.asarray(parameters[name], np.float32)[rows, chosen]
@@ -167,9 +168,3 @@ def _choose(valid: np.ndarray, uniform: np.ndarray) -> np.ndarray:
 def _take(values: Array | np.ndarray, entry: np.ndarray) -> np.ndarray:
     flat = np.asarray(values, np.float32).reshape(len(values), -1)
     return flat[np.arange(len(flat)), np.maximum(entry, 0)]
-
-
-def _resample(weights: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Return indices of equally weighted draws by systematic resampling, (fit, DRAWS)."""
-    levels = (np.arange(DRAWS) + first[:, None]) / DRAWS
-    return np.stack([draws_at(*row) for row in zip(levels, weights, strict=True)])

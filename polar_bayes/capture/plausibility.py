@@ -224,15 +224,16 @@ def _materials(capture: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
     return [("", capture)]
 
 
-def _azimuth_difference(capture: xr.Dataset) -> xr.DataArray:
-    """Return the angle between azimuths of viewer and light, degree, 0 to 180."""
-    return abs((capture["view_azimuth"] - capture["light_azimuth"] + 180.0) % 360.0 - 180.0)
+def azimuth_difference(views: xr.Dataset) -> xr.DataArray:
+    """Return the angle between azimuths of viewer and light, degree, 0 to 180: the mirror side."""
+    return abs((views["view_azimuth"] - views["light_azimuth"] + 180.0) % 360.0 - 180.0)
 
 
-def _at_mirror(capture: xr.Dataset) -> xr.DataArray:
-    """Return True for views at the mirror angle of the light."""
+def at_mirror(capture: xr.Dataset, within: float = 2.5) -> xr.DataArray:
+    """Return True for views in the mirror direction of the light, within so many degrees."""
     apart = abs(capture["view_zenith"] - capture["light_zenith"])
-    return (apart <= 2.5) & (_azimuth_difference(capture) >= 175.0)
+    sideways = 180.0 - azimuth_difference(capture)
+    return (apart <= within) & (sideways * np.sin(np.deg2rad(capture["view_zenith"])) <= within)
 
 
 def _valid(capture: xr.Dataset) -> xr.DataArray:
@@ -280,7 +281,7 @@ def _body_polarization(zenith: xr.DataArray) -> xr.DataArray:
 
 def _azimuth_cautions(capture: xr.Dataset) -> Iterator[str]:
     largest = max(float(abs(capture[f"{each}_azimuth"]).max()) for each in ("view", "light"))
-    at_pi = abs(_azimuth_difference(capture) - np.pi) < 0.01
+    at_pi = abs(azimuth_difference(capture) - np.pi) < 0.01
     if largest <= 2.0 * np.pi + 0.01 and bool(at_pi.any()):
         yield (
             "Viewer and light are pi degrees of azimuth apart, which looks like radians: give 180 "
@@ -331,7 +332,7 @@ def _sign_cautions(name: str, capture: xr.Dataset) -> Iterator[str]:
     """Caution against mirror views with more p light than the body alone can send."""
     if "q" not in capture:
         return
-    judged = _judged(capture, _at_mirror(capture), "q")
+    judged = _judged(capture, at_mirror(capture), "q")
     least = -_body_polarization(capture["view_zenith"]) - _noise(capture, "q")
     if share := _mostly(capture["q"] < least, judged):
         yield (
@@ -347,7 +348,7 @@ def _side_cautions(name: str, capture: xr.Dataset) -> Iterator[str]:
     signal = next((each for each in ("dop", "q") if each in capture), None)
     if signal is None or capture.attrs.get("setup") == "picture":  # light from everywhere
         return
-    apart = _azimuth_difference(capture)
+    apart = azimuth_difference(capture)
     if not bool((apart <= 20.0).all()):
         return
     judged = _judged(capture, apart <= 20.0, signal)
@@ -382,7 +383,7 @@ def _readings_sentence(capture: xr.Dataset) -> str:
     names = [f"{n} ({errors if f'{n}_error' in capture else 'no errors stated'})" for n in signals]
     zenith = capture["view_zenith"]
     views = capture.sizes["view"]
-    mirror = int(_at_mirror(capture).any([x for x in zenith.dims if x != "view"]).sum())
+    mirror = int(at_mirror(capture).any([x for x in zenith.dims if x != "view"]).sum())
     colors = "no wavelength is stated"
     if "wavelength" in capture.coords:
         values = np.atleast_1d(capture["wavelength"].values)
@@ -398,7 +399,7 @@ def _readings_sentence(capture: xr.Dataset) -> str:
 def _sign_sentences(name: str, capture: xr.Dataset) -> Iterator[str]:
     if "q" not in capture:
         return
-    judged = _judged(capture, _at_mirror(capture), "q")
+    judged = _judged(capture, at_mirror(capture), "q")
     if total := int(judged.sum()):
         count = int((judged & (capture["q"] > 0.0)).sum())
         yield f"Sign: q{name} is positive (s light) at {count} of {total} mirror angles."
@@ -424,7 +425,7 @@ def _brewster(capture: xr.Dataset) -> IndexByEye | None:
     if signal is None or {"y", "x"} & set(capture.dims):
         return None
     zenith = capture["view_zenith"]
-    used = _at_mirror(capture) & (zenith >= 20.0) & (zenith <= 85.0) & _valid(capture)
+    used = at_mirror(capture) & (zenith >= 20.0) & (zenith <= 85.0) & _valid(capture)
     readings = capture[signal].where(used)
     others = [dim for dim in readings.dims if dim != "view"]
     values = readings.mean(others).to_numpy()  # over wavelengths

@@ -32,10 +32,11 @@ from polar_bayes.inference.checks import (
     CARRIES,
     LARGE_FACTOR,
     MASS_AT_BOUND,
-    NEAR_BOUND,
     NOISE_FACTOR,
+    excluding_bounds,
     level,
     prior_conflict,
+    share_at,
     tail_scores,
 )
 from polar_bayes.inference.result import CENTRAL_95, bounds_of
@@ -272,12 +273,12 @@ def _bounds(fit: FitView, is_beyond: bool) -> Finding:
         prior = fit.prior.get(scalar.label)
         if prior is None or not np.isfinite(scalar.draws).all():
             continue
-        absent = absence(scalar.name)
-        for bound in filter(math.isfinite, bounds_of(fit.provenance, scalar.name)):
-            if absent is not None and absent.value == bound:
-                continue
-            share = _share_at(bound, scalar.draws)
-            if share >= MASS_AT_BOUND and _share_at(bound, prior.draws) < MASS_AT_BOUND:
+        for bound in excluding_bounds(scalar.name, bounds_of(fit.provenance, scalar.name)):
+            share, before = (
+                float(share_at(bound, draws.ravel(), np.ptp(np.quantile(draws, CENTRAL_95))))
+                for draws in (scalar.draws, prior.draws)
+            )
+            if share >= MASS_AT_BOUND > before:
                 hits.append((share, scalar, bound))
     if not hits:
         return Finding("passed")
@@ -312,12 +313,6 @@ def _index(fit: FitView) -> Finding:
     excluded = any(index and index.is_excluded(bounds, off) for index in by_eye.values())
     is_member = not parameter.endswith("_location")  # a population may have a far member
     return Finding("problem" if excluded and is_member else "caution", sentence=sentences[0])
-
-
-def _share_at(bound: float, draws: np.ndarray) -> float:
-    """Return the share of draws in a strip at a bound, its width a share of their interval."""
-    strip = NEAR_BOUND * float(np.diff(np.quantile(draws, CENTRAL_95))[0])
-    return float(np.mean(np.abs(draws - bound) < strip))
 
 
 # --- Systematic errors ----------------------------------------------------------------------------

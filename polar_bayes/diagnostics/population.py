@@ -19,7 +19,7 @@ import xarray as xr
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.diagnostics.view import FitView, Provenance, once
 from polar_bayes.inference.result import CENTRAL_95, bounds_of
-from polar_bayes.priors import RANGES
+from polar_bayes.priors import natural_scale
 
 SUMMARY_COLUMNS = (
     "members",
@@ -50,8 +50,7 @@ class Population:
     @property
     def scale(self) -> str:
         """Scale on which the population is normal: "log", "log odds" or "plain"."""
-        limits = RANGES.get(self.name, (-math.inf, math.inf))
-        return {(0.0, math.inf): "log", (0.0, 1.0): "log odds"}.get(limits, "plain")
+        return natural_scale(self.name)
 
     def to_scale(self, value: np.ndarray) -> np.ndarray:
         """From the unit of the parameter to the scale on which the population is normal."""

@@ -27,6 +27,7 @@ from polar_bayes.numerics.levenberg_marquardt import (
     init,
     step,
 )
+from polar_bayes.numerics.optimize import SAME_MODE
 from polar_bayes.observation.data import Observations
 
 CANDIDATES = 32
@@ -35,9 +36,8 @@ CANDIDATES = 32
 RESTARTS = tuple(range(1, 8))
 """Ranks of the prior draws from which pixels without an acceptable mode start again."""
 
-RANKS, SAME_MODE = 16, 0.1
-"""Number of prior draws from which a search for all modes starts; largest distance, in posterior
-sds, between two ends of searches that count as one mode."""
+RANKS = 16
+"""Number of prior draws from which a search for all modes starts."""
 
 SINGLE_PASSES, EXACT_PASSES = (5, 4, 8, 16, 32), (1, 1, 1, 2, 4, 8, 16)
 """Steps of each pass; converged pixels leave between passes. The first exact pass only evaluates

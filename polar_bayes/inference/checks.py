@@ -12,10 +12,13 @@ Silvapulle & Sen (2005), Constrained Statistical Inference, section 3.4 (chi-bar
 """
 
 import math
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from jaxtyping import Float
 from scipy import stats
+
+from polar_bayes.physics.part import absence
 
 CAUTION = 0.02
 """Probability, under a correct model, that one check gives a caution or a problem."""
@@ -39,6 +42,25 @@ CARRIES = 0.3
 
 ANGLE_SCALES = (4.0, 15.0)
 """Length scales, in degrees, on which residuals are tested for structure."""
+
+
+def excluding_bounds(name: str, support: Iterable[float]) -> Iterator[float]:
+    """Yield the finite ends of a parameter's support, but not a value at which it is absent."""
+    absent = absence(name)
+    for bound in filter(math.isfinite, support):
+        if absent is None or absent.value != bound:
+            yield bound
+
+
+def share_at(
+    bound: float,
+    draws: Float[np.ndarray, "... draw"],
+    width: Float[np.ndarray, "..."] | float,
+    weights: Float[np.ndarray, "... draw"] | None = None,
+) -> Float[np.ndarray, "..."]:
+    """Return the share of draws in the strip at a bound; `width` is that of their interval."""
+    is_near = np.abs(draws - bound) < NEAR_BOUND * np.asarray(width)[..., None]
+    return is_near.mean(axis=-1) if weights is None else np.sum(weights * is_near, axis=-1)
 
 
 def tail_scores(

@@ -23,10 +23,12 @@ from polar_bayes.inference.checks import (
     NEAR_BOUND,
     NOISE_FACTOR,
     PROBLEM,
+    excluding_bounds,
     prior_conflict,
+    share_at,
     tail_scores,
 )
-from polar_bayes.inference.compiled_model import MOMENTS, CompiledModel
+from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.prior_probability import has_probabilities, probability_below
 from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
 from polar_bayes.inference.program import Values
@@ -120,21 +122,11 @@ def _bounds(
     for scalar in scalars:
         name = scalar.name
         ends = support_bounds(priors[name]) if name in priors else RANGES.get(name, ())
-        absent = absence(name)
-        for bound in filter(math.isfinite, ends):
-            if absent is None or absent.value != bound:
-                draws = scalar.of(engine.prior_parameters)[None]
-                strip = NEAR_BOUND * np.diff(np.quantile(draws, CENTRAL_95))
-                weights = np.full((1, MOMENTS), 1.0 / MOMENTS)
-                if _share_at(bound, draws, weights, strip) < MASS_AT_BOUND:
-                    yield scalar, bound
-
-
-def _share_at(
-    bound: float, draws: np.ndarray, weights: np.ndarray, strip: np.ndarray
-) -> np.ndarray:
-    """Return the weighted share of draws, (pixel, draw), in a strip at a bound."""
-    return np.sum(weights * (np.abs(draws - bound) < strip[:, None]), axis=1)
+        draws = scalar.of(engine.prior_parameters)
+        width = np.ptp(np.quantile(draws, CENTRAL_95))
+        for bound in excluding_bounds(name, ends):
+            if share_at(bound, draws, width) < MASS_AT_BOUND:
+                yield scalar, bound
 
 
 class PixelCriticism:
@@ -169,12 +161,14 @@ class PixelCriticism:
         """Which pixels lie against a bound."""
         scalar, value = bound
         quantiles = scalar.of(self._marginals.quantiles)[:, at]
-        strip = NEAR_BOUND * (quantiles[HIGHEST] - quantiles[LOWEST])
+        width = quantiles[HIGHEST] - quantiles[LOWEST]
         gap = np.min(np.abs(quantiles[[LOWEST, HIGHEST]] - value), axis=0)
-        near = np.flatnonzero(gap < 2.0 * strip)  # of the others, no more than 2.5% can be there
+        near = np.flatnonzero(
+            gap < 2.0 * NEAR_BOUND * width
+        )  # of the others, no more than 2.5% can be there
         if near.size:
             draws = scalar.of(parameters)[near]
-            share = _share_at(value, draws, weights[near], strip[near])
+            share = share_at(value, draws, width[near], weights[near])
             self._at_bound[at[near]] |= share >= MASS_AT_BOUND
 
     def _find_carriers(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:

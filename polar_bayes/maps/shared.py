@@ -44,7 +44,7 @@ from polar_bayes.methods.corrected_laplace import CorrectedLaplace
 from polar_bayes.numerics.batches import AnyArray, map_elements
 from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.numerics.levenberg_marquardt import derivatives
-from polar_bayes.numerics.psis import draws_at
+from polar_bayes.numerics.psis import systematic_resample
 from polar_bayes.observation.data import Observations
 
 PIXELS = 512
@@ -303,9 +303,9 @@ def _resampled(weights: np.ndarray) -> np.ndarray:
     # In random order: every sixteenth of quasi-random points would not be spread like all of them.
     order = np.broadcast_to(np.arange(weights.shape[1]), weights.shape)
     order = np.random.default_rng(0).permuted(order, axis=1)
-    levels = (np.arange(DRAWS) + 0.5) / DRAWS
     rows = np.take_along_axis(weights, order, axis=1)
-    return np.take_along_axis(order, np.stack([draws_at(levels, row) for row in rows]), axis=1)
+    chosen = np.stack([systematic_resample(row, DRAWS) for row in rows])
+    return np.take_along_axis(order, chosen, axis=1)
 
 
 def _coordinates(engine: CompiledModel, _: None) -> JitOnce:

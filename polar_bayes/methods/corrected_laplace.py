@@ -49,7 +49,7 @@ HARD = 1024
 LANES = 4
 """Pixels of a batch that are computed together when each has hundreds of draws."""
 
-SAME_MODE = 1e-3
+SAME_POTENTIAL = 1e-3
 """Difference of potentials below which two modes count as one."""
 
 LEAST_RIVAL, LEAST_DISTANCE = 0.02, 1.0
@@ -149,7 +149,7 @@ class CorrectedLaplace(AbstractBatchMethod):
         batch = sample(SAMPLE)
         once = dataclasses.replace(self, starts=1)
         one, best = (_Run(method, batch).approximate() for method in (once, every))
-        is_lower = best.search.mode.value < one.search.mode.value - SAME_MODE
+        is_lower = best.search.mode.value < one.search.mode.value - SAME_POTENTIAL
         missed = int(np.sum(one.is_trusted & (is_lower | best.has_rival)))
         chosen = once if missed <= MOST_MISSED * len(batch) else every
         return chosen, {"starts_compared": {"pixels": len(batch), "missed": missed}}
@@ -206,7 +206,7 @@ class _Run:
                 break
             old, begin = take_rows(found.search, untrusted), ranked[untrusted, rank]
             new = find_modes_from(self.batch.subset(untrusted), begin, old)
-            is_lower = new.mode.value < old.mode.value - SAME_MODE
+            is_lower = new.mode.value < old.mode.value - SAME_POTENTIAL
             is_better = new.converged & (~old.converged | is_lower)
             is_other = old.mode.distance(new.mode.z) > LEAST_DISTANCE  # False where one is NaN
             left_out = np.where(is_better, old.mode.log_evidence, new.mode.log_evidence)

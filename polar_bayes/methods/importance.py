@@ -54,8 +54,8 @@ from polar_bayes.numerics.psis import (
     FINITE_VARIANCE,
     MAX_PARETO_K,
     numpy_generator,
+    resampled_chains,
     smooth,
-    systematic_resample,
     weighted_ess,
 )
 from polar_bayes.observation.data import Observations
@@ -111,7 +111,7 @@ class Importance(AbstractMethod):
                 hint="use method='nuts'",
             )
         z = coordinates.forward(sample.z)
-        index = systematic_resample(weights, effective, numpy_generator(key_resample))
+        index = resampled_chains(weights, effective, numpy_generator(key_resample))
         problems = []
         if not pareto_k <= MAX_PARETO_K:
             problems.append(

@@ -31,11 +31,11 @@ from polar_bayes.inference.result import Provenance
 from polar_bayes.methods.importance import ONE_ROUND, suits_profiles, tail_shares
 from polar_bayes.methods.method import AbstractMethod, PosteriorDraws
 from polar_bayes.numerics.compile import compiled
-from polar_bayes.numerics.mcse import measure
+from polar_bayes.numerics.mcse import LARGEST_R_HAT, measure
 from polar_bayes.progress import Progress
 
-LARGEST_R_HAT = 1.008
-"""A little below the 1.01 at which a fit is refused."""
+R_HAT_GOAL = 1.0 + 0.8 * (LARGEST_R_HAT - 1.0)
+"""R-hat at which chains end: a little below that at which a fit is refused."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -288,7 +288,7 @@ def _converged(rounds: list[Step], settings: Nuts) -> bool:
     z = np.asarray(_stacked(rounds).z)
     bulk, tail, r_hat = measure(np.moveaxis(z, -1, 0))
     smallest = min(bulk.min(), tail.min())
-    return bool(smallest >= settings.ess and r_hat.max() <= LARGEST_R_HAT)
+    return bool(smallest >= settings.ess and r_hat.max() <= R_HAT_GOAL)
 
 
 class Static(NamedTuple):

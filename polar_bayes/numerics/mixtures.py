@@ -25,6 +25,8 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
 from scipy.stats import qmc
 
+from polar_bayes.numerics.psis import systematic_resample
+
 # --- One normal or Student t distribution for each pixel ------------------------------------------
 
 
@@ -163,12 +165,6 @@ def moments(
     return center, sd[:, None] * jnp.linalg.cholesky(lifted)
 
 
-def resample(weights: Float[Array, " draw"], count: int, key: Array) -> Array:
-    """Return indices of `count` draws by systematic resampling."""
-    even = (jnp.arange(count) + jax.random.uniform(key)) / count
-    return jnp.clip(jnp.searchsorted(jnp.cumsum(weights), even), 0, len(weights) - 1)
-
-
 def fit_mixture(
     z: Float[Array, "draw size"], weights: Float[Array, " draw"], components: int, key: Array
 ) -> Mixture:
@@ -211,7 +207,8 @@ def fit_mixture(
 def draw_mixture(mixture: Mixture, count: int, key: Array) -> Float[Array, "draw size"]:
     """Draw from the mixture, with components chosen by systematic resampling."""
     key_which, key_normal, key_tail = jax.random.split(key, 3)
-    which = resample(jnp.exp(mixture.log_share), count, key_which)
+    share = jnp.exp(mixture.log_share)
+    which = systematic_resample(share, count, jax.random.uniform(key_which))
     dtype, freedom = mixture.mean.dtype, DEGREES_OF_FREEDOM
     tail = jax.random.gamma(key_tail, 0.5 * freedom, (count, 1), dtype) * 2.0 / freedom
     noise = jax.random.normal(key_normal, (count, mixture.mean.shape[-1]), dtype) / jnp.sqrt(tail)

@@ -147,23 +147,27 @@ FEWEST, MOST = 50, 10_000
 """Fewest and most resampled draws of each group."""
 
 
-def systematic_resample(
+def resampled_chains(
     weights: Float[np.ndarray, " draw"], effective: float, random: np.random.Generator
 ) -> Float[np.ndarray, "chain draw"]:
     """Return indices of draws resampled by weight, in random order."""
     # As many are drawn as the effective sample size: more would look like more than is known.
-    # Source: Kitagawa (1996), J. Comput. Graph. Stat. 5(1), 1-25.
     each = int(np.clip(effective / CHAINS, FEWEST, MOST))
-    levels = (np.arange(CHAINS * each) + random.random()) / (CHAINS * each)
-    index = draws_at(levels, weights)
+    index = systematic_resample(weights, CHAINS * each, random.random())
     return random.permutation(index).reshape(CHAINS, each)
 
 
-def draws_at(
-    levels: Float[np.ndarray, " level"], weights: Float[np.ndarray, " draw"]
-) -> Float[np.ndarray, " level"]:
-    """Return indices of the draws at which the cumulative weight reaches each level."""
-    return np.clip(np.searchsorted(np.cumsum(weights), levels), 0, len(weights) - 1)
+def systematic_resample(weights: AnyArray, count: int, first: float | Array = 0.5) -> AnyArray:
+    """Return increasing indices of draws, each as often as its weight is worth.
+
+    `first`, of 0 to 1, moves all the levels of cumulative weight at which a draw is taken.
+
+    Source:
+        Kitagawa (1996), J. Comput. Graph. Stat. 5(1), 1-25.
+    """
+    xp = weights.__array_namespace__()  # of JAX within a program
+    levels = (xp.arange(count) + first) / count
+    return xp.clip(xp.searchsorted(xp.cumsum(weights), levels), 0, len(weights) - 1)
 
 
 def max_effective_size(count: int) -> float:

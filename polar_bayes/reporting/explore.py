@@ -21,6 +21,7 @@ import xarray as xr
 from jaxtyping import Array
 from numpyro import handlers
 
+from polar_bayes.capture.plausibility import azimuth_difference
 from polar_bayes.capture.schema import validate
 from polar_bayes.diagnostics.coverage import INTERVALS, map_scalars
 from polar_bayes.diagnostics.parameters import Scalar
@@ -273,8 +274,7 @@ def map_readings(
     grid = {dim: slice(None, None, step) for dim in IMAGE}
     some = validate(mask_missing(capture.isel(grid).load()))
     fitted = {} if plan is None else _fitted(plan, some, maps.isel(grid), names)
-    # A turn of 180 degrees is the mirror side.
-    turn = abs((some["view_azimuth"] - some["light_azimuth"] + 180.0) % 360.0 - 180.0)
+    turn = azimuth_difference(some)
     zenith = some["view_zenith"] * xr.where(turn < 90.0, -1.0, 1.0)
     panels, codes = [], []
     for name in names:

@@ -8,6 +8,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from polar_bayes.capture.plausibility import azimuth_difference
 from polar_bayes.diagnostics.parameters import SAMPLE_DIMS, Scalar, is_hyperparameter, scalars
 from polar_bayes.diagnostics.view import FitView, once, view_of
 from polar_bayes.errors import FitError
@@ -56,7 +57,6 @@ def curves(fit: FitView, name: str) -> list[xr.Dataset]:
     if predicted.sizes["chain"] * predicted.sizes["draw"] == 1:
         # A point fit has a single draw, whose quantiles would look like certainty.
         levels = levels * np.nan
-    turn = constants["view_azimuth"] - constants["light_azimuth"]
     data = xr.Dataset(
         {
             "observed": observed,
@@ -66,7 +66,7 @@ def curves(fit: FitView, name: str) -> list[xr.Dataset]:
             "levels": levels,
             "zenith": constants["view_zenith"],
             "light_zenith": constants["light_zenith"],
-            "azimuth": np.abs((turn + 180.0) % 360.0 - 180.0),
+            "azimuth": azimuth_difference(constants),
         }
     ).map(lambda variable: variable.broadcast_like(observed))
     lead = [str(dim) for dim in observed.dims if dim != "view"]

@@ -18,7 +18,7 @@ from polar_bayes.benchmark.reference import ReferenceRun, best_reference, run_re
 from polar_bayes.benchmark.run import AbstractOverride, Trial, run_in_subprocess
 from polar_bayes.methods.method import AbstractMethod, PosteriorDraws
 from polar_bayes.numerics.mcse import standard_errors
-from polar_bayes.numerics.psis import systematic_resample
+from polar_bayes.numerics.psis import resampled_chains
 from polar_bayes.physics.variants import parts_of
 
 LINKS = {"q": pb.links.StokesLink()}
@@ -252,7 +252,7 @@ def test_draws_chosen_by_weight_have_the_error_of_their_weights_too():
         z = 1.5 * random.standard_normal((count, 1))
         weights = np.exp(-0.5 * z[:, 0] ** 2 * (1.0 - 1.0 / 1.5**2))
         weights /= weights.sum()
-        chosen = z[systematic_resample(weights, 1.0 / np.sum(weights**2), random)]
+        chosen = z[resampled_chains(weights, 1.0 / np.sum(weights**2), random)]
         found = PosteriorDraws("importance", chosen, {}, weighted=(z, weights))
         mean, _ = found.standard_errors(lambda z: np.moveaxis(z, -1, 0))
         told.append(mean[0])

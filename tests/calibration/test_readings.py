@@ -12,10 +12,8 @@ from synthetic_calibrations import make_calibration
 
 import polar_bayes as pb
 from polar_bayes.calibration.predictive import (
-    DRAWS,
     PredictivePit,
     _choose,
-    _resample,
     unranked_reason,
 )
 from polar_bayes.calibration.runner import draw_captures
@@ -81,15 +79,6 @@ def test_masked_entries_are_never_chosen(read) -> None:
     for chance in (0.0, 0.49, 0.5, 0.999999):
         found = _choose(valid, np.full(2, chance))
         assert found.tolist() == [1 if chance < 0.5 else 2, -1]
-
-
-@pytest.mark.thorough
-def test_heavy_draws_are_repeated() -> None:
-    weights = np.array([[0.5, 0.25, 0.25, 0.0], [0.25, 0.25, 0.25, 0.25]])
-    found = _resample(weights, np.array([0.5, 0.5]))
-    counts = [np.bincount(row, minlength=4).tolist() for row in found]
-    assert counts[0] == [DRAWS // 2, DRAWS // 4, DRAWS // 4, 0]
-    assert np.ptp(counts[1]) <= 1
 
 
 @pytest.mark.thorough
