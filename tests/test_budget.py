@@ -13,7 +13,7 @@ CODE = {
     "benchmark": 574,
     "calibration": 1035,
     "capture": 814,
-    "cli": 1255,
+    "cli": 1256,
     "design": 1086,
     "diagnostics": 1786,
     "importers": 2109,
@@ -32,7 +32,7 @@ CODE = {
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25500,
+    "code": 25501,
     "classes": 337,
     "constants": 418,
     "Any": 193,

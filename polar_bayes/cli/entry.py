@@ -16,6 +16,7 @@ import contextlib
 import contextvars
 import ctypes
 import functools
+import gc
 import logging
 import os
 import signal
@@ -202,6 +203,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _own_process() -> int:
     """Run the command of the process itself, and flush its output before errors are printed."""
+    gc.set_threshold(100_000, 50)  # traces are many objects and few cycles: a tenth of a fit
     limit_arenas()
     quiet_libraries()
     keep_compiled_programs()
