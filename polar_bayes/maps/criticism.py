@@ -163,9 +163,8 @@ class PixelCriticism:
         quantiles = scalar.of(self._marginals.quantiles)[:, at]
         width = quantiles[HIGHEST] - quantiles[LOWEST]
         gap = np.min(np.abs(quantiles[[LOWEST, HIGHEST]] - value), axis=0)
-        near = np.flatnonzero(
-            gap < 2.0 * NEAR_BOUND * width
-        )  # of the others, no more than 2.5% can be there
+        # Of the others, no more than 2.5% can be there.
+        near = np.flatnonzero(gap < 2.0 * NEAR_BOUND * width)
         if near.size:
             draws = scalar.of(parameters)[near]
             share = share_at(value, draws, width[near], weights[near])
