@@ -18,7 +18,7 @@ CODE = {
     "diagnostics": 1786,
     "importers": 2109,
     "inference": 2708,
-    "maps": 1709,
+    "maps": 1707,
     "methods": 1226,
     "numerics": 993,
     "observation": 499,
@@ -27,12 +27,12 @@ CODE = {
     "scenes": 1759,
     "own files": 1571,
     "models": 320,
-    "tests": 24056,
+    "tests": 24058,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25501,
+    "code": 25499,
     "classes": 337,
     "constants": 418,
     "Any": 193,

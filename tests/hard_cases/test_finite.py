@@ -228,6 +228,10 @@ def test_value_gradient_and_hessian_of_other_scenes_are_finite(name: str, dtype:
 BATCH = 600
 """Rows that are in memory together, a third of the catalogue's."""
 
+ALONE = {"xla_disable_hlo_passes": "fusion"}
+"""Each operation is compiled once: fused into all that read it, those of a film compile for minutes
+and need more memory than a machine has."""
+
 # Points drawn at random, of all scenes together.
 POINTS = 65_000
 
@@ -271,7 +275,8 @@ def check_finite(name: str, names: list[str], inputs: np.ndarray) -> None:
 
     # All rows at once, and the programs of all scenes, would need more memory than a machine has.
     # One program, which the other test finds on the disk, takes all parts: the last is filled up.
-    program, length = jax.jit(jax.vmap(derivatives)), len(inputs)
+    program = jax.jit(jax.vmap(derivatives), compiler_options=ALONE)
+    length = len(inputs)
     filled = np.resize(inputs, (-(-length // BATCH) * BATCH, inputs.shape[1]))
     parts = [jax.device_get(program(part)) for part in filled.reshape(-1, BATCH, inputs.shape[1])]
     results = [np.concatenate(each)[:length] for each in zip(*parts, strict=True)]
