@@ -15,10 +15,10 @@ CODE = {
     "capture": 814,
     "cli": 1256,
     "design": 1086,
-    "diagnostics": 1786,
+    "diagnostics": 1783,
     "importers": 2109,
-    "inference": 2708,
-    "maps": 1707,
+    "inference": 2710,
+    "maps": 1705,
     "methods": 1226,
     "numerics": 993,
     "observation": 499,
@@ -27,12 +27,12 @@ CODE = {
     "scenes": 1759,
     "own files": 1571,
     "models": 320,
-    "tests": 24058,
+    "tests": 24060,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25499,
+    "code": 25496,
     "classes": 337,
     "constants": 418,
     "Any": 193,

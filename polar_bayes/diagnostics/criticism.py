@@ -274,11 +274,8 @@ def _bounds(fit: FitView, is_beyond: bool) -> Finding:
         if prior is None or not np.isfinite(scalar.draws).all():
             continue
         for bound in excluding_bounds(scalar.name, bounds_of(fit.provenance, scalar.name)):
-            share, before = (
-                float(share_at(bound, draws.ravel(), np.ptp(np.quantile(draws, CENTRAL_95))))
-                for draws in (scalar.draws, prior.draws)
-            )
-            if share >= MASS_AT_BOUND > before:
+            share = float(share_at(bound, scalar.draws.ravel()))
+            if share >= MASS_AT_BOUND > share_at(bound, prior.draws.ravel()):
                 hits.append((share, scalar, bound))
     if not hits:
         return Finding("passed")

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
+from polar_bayes.inference.result import CENTRAL_95
 from polar_bayes.physics.part import absence
 
 CAUTION = 0.02
@@ -55,11 +56,13 @@ def excluding_bounds(name: str, support: Iterable[float]) -> Iterator[float]:
 def share_at(
     bound: float,
     draws: Float[np.ndarray, "... draw"],
-    width: Float[np.ndarray, "..."] | float,
     weights: Float[np.ndarray, "... draw"] | None = None,
+    width: Float[np.ndarray, "..."] | None = None,
 ) -> Float[np.ndarray, "..."]:
     """Return the share of draws in the strip at a bound; `width` is that of their interval."""
-    is_near = np.abs(draws - bound) < NEAR_BOUND * np.asarray(width)[..., None]
+    if width is None:
+        width = np.ptp(np.quantile(draws, CENTRAL_95, axis=-1), axis=0)
+    is_near = np.abs(draws - bound) < NEAR_BOUND * width[..., None]
     return is_near.mean(axis=-1) if weights is None else np.sum(weights * is_near, axis=-1)
 
 

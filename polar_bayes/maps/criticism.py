@@ -32,7 +32,6 @@ from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.prior_probability import has_probabilities, probability_below
 from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
 from polar_bayes.inference.program import Values
-from polar_bayes.inference.result import CENTRAL_95
 from polar_bayes.maps.residuals import direction_kernels, fitted_readings, residual_tail
 from polar_bayes.numerics.psis import LEVELS, Marginals
 from polar_bayes.observation.links import PERFECT
@@ -122,10 +121,8 @@ def _bounds(
     for scalar in scalars:
         name = scalar.name
         ends = support_bounds(priors[name]) if name in priors else RANGES.get(name, ())
-        draws = scalar.of(engine.prior_parameters)
-        width = np.ptp(np.quantile(draws, CENTRAL_95))
         for bound in excluding_bounds(name, ends):
-            if share_at(bound, draws, width) < MASS_AT_BOUND:
+            if share_at(bound, scalar.of(engine.prior_parameters)) < MASS_AT_BOUND:
                 yield scalar, bound
 
 
@@ -167,7 +164,7 @@ class PixelCriticism:
         near = np.flatnonzero(gap < 2.0 * NEAR_BOUND * width)
         if near.size:
             draws = scalar.of(parameters)[near]
-            share = share_at(value, draws, width[near], weights[near])
+            share = share_at(value, draws, weights[near], width[near])
             self._at_bound[at[near]] |= share >= MASS_AT_BOUND
 
     def _find_carriers(self, at: np.ndarray, parameters: Values, weights: np.ndarray) -> None:

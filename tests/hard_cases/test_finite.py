@@ -280,7 +280,7 @@ def check_finite(name: str, names: list[str], inputs: np.ndarray) -> None:
     filled = np.resize(inputs, (-(-length // BATCH) * BATCH, inputs.shape[1]))
     parts = [jax.device_get(program(part)) for part in filled.reshape(-1, BATCH, inputs.shape[1])]
     results = [np.concatenate(each)[:length] for each in zip(*parts, strict=True)]
-    jax.clear_caches()
+    program.clear_cache()
     for what, result in zip(("value", "gradient", "Hessian"), results, strict=True):
         assert result.dtype == dtype
         broken = np.unique(np.nonzero(~np.isfinite(np.asarray(result)))[0])

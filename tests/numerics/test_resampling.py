@@ -47,5 +47,7 @@ def test_a_compiled_program_chooses_the_same_draws():
     weights = np.array([0.5, 0.25, 0.25, 0.0])
     chosen = systematic_resample(weights, 128, 0.5)
     assert np.bincount(chosen, minlength=4).tolist() == [64, 32, 32, 0]
+    equal = systematic_resample(np.full(4, 0.25), 128, 0.5)
+    assert np.ptp(np.bincount(equal, minlength=4)) <= 1
     program = jax.jit(systematic_resample, static_argnums=1)
     np.testing.assert_array_equal(program(jnp.asarray(weights), 128, 0.5), chosen)
