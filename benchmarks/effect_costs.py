@@ -79,7 +79,9 @@ def gradients(scenes: list[pb.Scene], data: xr.Dataset) -> list[tuple[float, flo
     """Operations, compile and run seconds of a log density with its gradient, by scene."""
     compiled, calls = [], []
     for scene in scenes:
-        request = resolve(data, "per_material", scene, None, None, None, 0, "double")
+        # The set-up of the capture would add its input quantities to every scene.
+        arguments = (data, "per_material", scene, None, None, None, 0, "double")
+        request = resolve(*arguments, is_perfect=True)
         readings = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
         program = compile_program(request.bind(), readings)
         z = np.zeros(program.size)

@@ -22,7 +22,7 @@ CODE = {
     "methods": 1226,
     "numerics": 993,
     "observation": 499,
-    "physics": 2746,
+    "physics": 2748,
     "reporting": 3310,
     "scenes": 1759,
     "own files": 1571,
@@ -32,7 +32,7 @@ CODE = {
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25496,
+    "code": 25498,
     "classes": 337,
     "constants": 418,
     "Any": 193,

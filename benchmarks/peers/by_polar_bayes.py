@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 
-from one_material import SCENE
 from posterior import AbstractPeer, Round
 
 import polar_bayes as pb
@@ -12,7 +11,8 @@ class Peer(AbstractPeer):
     packages = ("polar_bayes",)
 
     def rounds(self, seed: int) -> Iterator[Round]:
-        found = pb.fit(self.posterior.capture, method=pb.methods.Nuts(), scene=SCENE, seed=seed)
+        capture, scene = self.posterior.capture, self.posterior.scene
+        found = pb.fit(capture, method=pb.methods.Nuts(), scene=scene, seed=seed)
         parameters = {name: found["posterior"][name].values for name in found["prior"].data_vars}
         steps = found["sample_stats"]
         evaluations = int(steps["n_steps"].sum() + steps["warmup_steps"].isel(draw=0).sum())

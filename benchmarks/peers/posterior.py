@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from jaxtyping import Array
-from one_material import SCENE
 
 from polar_bayes.inference.program import Program, compile_program, from_prior
 from polar_bayes.inference.request import Request, resolve
 from polar_bayes.observation.data import Observations, observe
+from polar_bayes.physics.scene import Scene
 
 CHAINS = 4
 
@@ -27,13 +27,15 @@ class Posterior:
 
     Args:
         capture: The readings.
+        scene: What was seen; None for the scene that the capture names.
     """
 
     capture: xr.Dataset
+    scene: Scene | None
 
     @functools.cached_property
     def request(self) -> Request:
-        return resolve(self.capture, "per_material", SCENE, None, None, None, 0, "double")
+        return resolve(self.capture, "per_material", self.scene, None, None, None, 0, "double")
 
     @functools.cached_property
     def data(self) -> Observations:

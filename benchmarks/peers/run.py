@@ -4,11 +4,13 @@
     python benchmarks/peers/run.py                  all of them
     python benchmarks/peers/run.py numpyro emcee    some
     python benchmarks/peers/run.py --limit 300      seconds that each may take, twice
+    python benchmarks/peers/run.py --colors 3       the capture of `polar-bayes demo`
 
 The per-material model of one color: 40 views of the degree of polarization and of intensity by the
 paper's scene with four facets on the way out; four parameters of the material, three of the noise.
-A peer samples in rounds until R-hat is at most 1.01, and the bulk and the tail of every parameter
-are worth 400 draws, or until its time is up. The time that this takes to judge does not count.
+Or that of the three colors of `polar-bayes demo`, with eight parameters of the material. A peer
+samples in rounds until R-hat is at most 1.01, and the bulk and the tail of every number are worth
+400 draws, or until its time is up. The time that this takes to judge does not count.
 
 Each runs in a process of its own without a cache of compiled programs. "cold" counts from the start
 of the process, imports and compilation included; "warm" is a second run with another seed. Error is
@@ -47,15 +49,26 @@ DEVICE_EACH = ("numpyro", "blackjax")
 LARGEST_R_HAT, LEAST_WORTH = 1.01, 400.0
 PATIENCE = 4
 """Limits after which a process is stopped: a round that has begun may take longer than its time."""
+SCENES = {1: SCENE, 3: None}
+"""By number of colors; None is the scene that the demo's capture names."""
 LONG = 20_000
 """Number of draws of the reference, per chain."""
 
 
+def scalars(parameters: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Draws (chain, draw) of each number; those of several colors are numbered."""
+    return {
+        name if drawn.ndim == 2 else f"{name}[{i}]": each
+        for name, drawn in parameters.items()
+        for i, each in enumerate(np.moveaxis(drawn.reshape(*drawn.shape[:2], -1), -1, 0))
+    }
+
+
 def judge(found: Any, reference: dict[str, list[float]]) -> dict[str, Any]:
     """Return diagnostics and errors of the draws of one round."""
-    rows = []
+    rows, all_drawn = [], scalars(found.parameters)
     for name, (mean, sd, _) in reference.items():
-        drawn = found.parameters[name]
+        drawn = all_drawn[name]
         weights = np.ones(drawn.shape) if found.weights is None else found.weights
         own = np.average(drawn, weights=weights)
         own_sd = np.sqrt(np.average((drawn - own) ** 2, weights=weights))
@@ -64,17 +77,17 @@ def judge(found: Any, reference: dict[str, list[float]]) -> dict[str, Any]:
     told["evaluations"] = found.evaluations
     if found.worth is not None:
         return told | {"worth": found.worth, "r_hat": None, "done": found.worth >= LEAST_WORTH}
-    bulk, tail, r_hat = measure(np.stack([found.parameters[name] for name in reference]))
+    bulk, tail, r_hat = measure(np.stack([all_drawn[name] for name in reference]))
     worth, worst = float(min(bulk.min(), tail.min())), float(r_hat.max())
     done = worth >= LEAST_WORTH and worst <= LARGEST_R_HAT
     return told | {"worth": worth, "r_hat": worst, "done": done}
 
 
-def sample_one(name: str, folder: Path, began: float, limit: float) -> None:
+def sample_one(name: str, folder: Path, began: float, limit: float, colors: int) -> None:
     """Both runs of one peer, in this process; one line of JSON."""
     peers = importlib.import_module(f"by_{name}")
     reference = json.loads((folder / "reference.json").read_text())
-    peer = peers.Peer(Posterior(pb.load_capture(folder / "capture.nc")))
+    peer = peers.Peer(Posterior(pb.load_capture(folder / "capture.nc"), SCENES[colors]))
     told: dict[str, Any] = {"versions": peer.versions}
     for run in ("cold", "warm"):
         start, judging, judged = (began if run == "cold" else time.time()), 0.0, {}
@@ -89,16 +102,17 @@ def sample_one(name: str, folder: Path, began: float, limit: float) -> None:
     print(json.dumps(told, default=float))
 
 
-def compile_model(folder: Path) -> dict[str, list[float]]:
-    """The capture, and a long run: mean, sd and Monte Carlo error of the mean of each parameter."""
-    capture = layout()
+def reference_of(folder: Path, colors: int) -> dict[str, list[float]]:
+    """The capture, and a long run: mean, sd and Monte Carlo error of the mean of each number."""
+    capture = layout() if colors == 1 else pb.simulate("plastic", seed=0)
     pb.save_capture(capture, folder / "capture.nc")
     method = pb.methods.Nuts(draws=LONG, most_draws=LONG, ess=1.0)
-    found = pb.summary(pb.fit(capture, method=method, scene=SCENE, seed=99))
-    long = {
-        str(name): [float(row["mean"]), float(row["sd"]), float(row["mcse_mean"])]
-        for name, row in found.iterrows()
-    }
+    found = pb.fit(capture, method=method, scene=SCENES[colors], seed=99)
+    draws = {name: found["posterior"][name].values for name in found["prior"].data_vars}
+    long = {}
+    for name, drawn in scalars(draws).items():
+        sd = float(drawn.std())
+        long[name] = [float(drawn.mean()), sd, sd / float(np.sqrt(measure(drawn[None])[0].min()))]
     (folder / "reference.json").write_text(json.dumps(long))
     return long
 
@@ -119,18 +133,18 @@ def table_line(name: str, told: dict[str, Any]) -> str:
     )
 
 
-def main(names: list[str], limit: float) -> None:
-    print(f"{platform.machine()}, {os.cpu_count()} cores")
+def main(names: list[str], limit: float, colors: int) -> None:
+    print(f"{platform.machine()}, {os.cpu_count()} cores, colors: {colors}")
     with tempfile.TemporaryDirectory() as path:
         folder = Path(path)
-        long = compile_model(folder)
+        long = reference_of(folder, colors)
         error = max(row[2] / row[1] for row in long.values())
         print(f"reference: Monte Carlo error of the means at most {error:.4f} sd")
         print(f"{'':<12}{'cold s':>8} {'warm s':>8} {'evaluated':>9}{'ESS':>8}{'R-hat':>8}", end="")
         print(f"{'ESS/s':>10}{'mean':>8}{'sd':>8}   * its time was up", flush=True)
         for name in names:
             command = [sys.executable, __file__, "--one", name, "--folder", path]
-            command += ["--limit", str(limit), "--began", str(time.time())]
+            command += ["--limit", str(limit), "--colors", str(colors), "--began", str(time.time())]
             quiet = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
             quiet |= {"JAX_NUM_CPU_DEVICES": str(CHAINS)} if name in DEVICE_EACH else {}
             try:
@@ -150,11 +164,13 @@ if __name__ == "__main__":
     asked = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     asked.add_argument("names", nargs="*", metavar="PEER", help=", ".join(PEERS))
     asked.add_argument("--limit", type=float, default=300.0, help="seconds of each run")
+    asked.add_argument("--colors", type=int, choices=tuple(SCENES), default=1, help="1 or 3")
     for hidden in ("--one", "--folder", "--began"):
         asked.add_argument(hidden, help=argparse.SUPPRESS)
     given = asked.parse_args()
     jax.config.update("jax_enable_x64", True)
     if given.one is None:
-        main(given.names or list(PEERS), given.limit)
+        main(given.names or list(PEERS), given.limit, given.colors)
     else:
-        sample_one(given.one, Path(given.folder), float(given.began), given.limit)
+        folder, began = Path(given.folder), float(given.began)
+        sample_one(given.one, folder, began, given.limit, given.colors)

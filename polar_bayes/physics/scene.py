@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import ClassVar, override
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
@@ -184,7 +185,7 @@ class Scene(HTMLRepr):
             light = self.instrument.record(per_view, geometry, light)
         intensity, q, u = jnp.broadcast_arrays(*light)
         dop = degree_of_linear_polarization(q, u)
-        return {"dop": dop, "q": q, "u": u, "intensity": intensity}
+        return _computed_once({"dop": dop, "q": q, "u": u, "intensity": intensity})
 
     def has(self, term: type[AbstractInstrumentTerm]) -> bool:
         """Return whether the instrument has a term of a type.
@@ -255,11 +256,11 @@ class Scene(HTMLRepr):
         stack = Stack(parameters["refractive_index"], layers)
         surface = self.surface.light(parameters, geometry, stack)
         if self.subsurface is None or self.mixing is None:
-            return Light(*jnp.broadcast_arrays(*surface))
+            return _computed_once(Light(*jnp.broadcast_arrays(*surface)))
         interface = Interface(self.surface, stack)
         subsurface = self.subsurface.light(parameters, geometry, interface)
         mixture = self.mixing.mix(parameters["subsurface_fraction"], surface, subsurface)
-        return Light(*jnp.broadcast_arrays(*mixture))
+        return _computed_once(Light(*jnp.broadcast_arrays(*mixture)))
 
     def _neutral_quantities(self) -> dict[str, float]:
         known = (term for term in self.terms if isinstance(term, AbstractInputQuantity))
@@ -286,6 +287,11 @@ class Scene(HTMLRepr):
             raise SceneError(f"{', '.join(missing)} missing", where="parameters", hint=hint)
         dtype = jnp.result_type(geometry.dtype, *(parameters[name] for name in needed))
         return {name: jnp.asarray(parameters[name], dtype)[..., None] for name in needed}
+
+
+def _computed_once[T](readings: T) -> T:
+    """The same values; XLA's CPU compiler would fuse the optics into each of their readers."""
+    return jax.lax.optimization_barrier(readings)
 
 
 class UnsuitablePartsError(SceneError):
