@@ -6,6 +6,7 @@ Every effect of three scenes is switched on alone in the plain scene that is lef
 Prints a Markdown table.
 """
 
+import argparse
 import dataclasses
 
 import jax
@@ -120,6 +121,7 @@ def table(scene: pb.Scene, data: xr.Dataset) -> list[str]:
 
 def main() -> None:
     """Print the table."""
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     jax.config.update("jax_enable_x64", True)
     data = capture()
     print("| effect on | operations | ratio | compilation | one gradient | ratio |")

@@ -27,7 +27,7 @@ CODE = {
     "scenes": 1759,
     "own files": 1571,
     "models": 320,
-    "tests": 24060,
+    "tests": 24063,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
