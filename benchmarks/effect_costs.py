@@ -2,7 +2,7 @@
 
     python benchmarks/effect_costs.py
 
-Every effect of three scenes is switched on alone in the plain scene that is left when all are off.
+Every effect of five scenes is switched on alone in the plain scene that is left when all are off.
 Prints a Markdown table.
 """
 

@@ -39,7 +39,7 @@ from one_material import SCENE, layout
 from posterior import CHAINS, Posterior
 
 import polar_bayes as pb
-from polar_bayes.numerics.mcse import measure
+from polar_bayes.numerics.mcse import measure, standard_errors
 
 PEERS = (
     "polar_bayes", "numpyro", "blackjax", "pymc", "emcee", "bumps", "scipy",
@@ -111,8 +111,8 @@ def reference_of(folder: Path, colors: int) -> dict[str, list[float]]:
     draws = {name: found["posterior"][name].values for name in found["prior"].data_vars}
     long = {}
     for name, drawn in scalars(draws).items():
-        sd = float(drawn.std())
-        long[name] = [float(drawn.mean()), sd, sd / float(np.sqrt(measure(drawn[None])[0].min()))]
+        sd, (error, _) = float(drawn.std()), standard_errors(drawn[None])
+        long[name] = [float(drawn.mean()), sd, sd * float(error[0])]
     (folder / "reference.json").write_text(json.dumps(long))
     return long
 
