@@ -170,10 +170,12 @@ def every_option(command: click.Command) -> set[str]:
 
 @of_every_page
 def test_the_options_that_a_page_names_exist(page: Path) -> None:
-    known = every_option(commands) | {"--help"}
+    options = r"(?<!\S)--[a-z][a-z-]*"
     for code in inline(page):
-        named = set(re.findall(r"(?<!\S)--[a-z][a-z-]*", code))
-        assert named <= known, f"{page.name}: {named - known}"
+        script = re.match(r"python (\S+\.py)", code)
+        known = re.findall(options, (ROOT / script[1]).read_text()) if script else every_option(commands)
+        missing = set(re.findall(options, code)) - {"--help", *known}
+        assert not missing, f"{page.name}: {missing}"
 
 
 def test_two_commands_set_everything_up() -> None:
