@@ -17,24 +17,24 @@ CODE = {
     "design": 1086,
     "diagnostics": 1783,
     "importers": 2109,
-    "inference": 2710,
+    "inference": 2711,
     "maps": 1705,
     "methods": 1226,
-    "numerics": 993,
+    "numerics": 997,
     "observation": 499,
     "physics": 2748,
     "reporting": 3310,
     "scenes": 1759,
     "own files": 1571,
     "models": 320,
-    "tests": 24063,
+    "tests": 24091,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25498,
+    "code": 25503,
     "classes": 337,
-    "constants": 418,
+    "constants": 419,
     "Any": 193,
     "longest function": 80,
 }

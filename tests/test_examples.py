@@ -173,7 +173,11 @@ def test_the_options_that_a_page_names_exist(page: Path) -> None:
     options = r"(?<!\S)--[a-z][a-z-]*"
     for code in inline(page):
         script = re.match(r"python (\S+\.py)", code)
-        known = re.findall(options, (ROOT / script[1]).read_text()) if script else every_option(commands)
+        known = (
+            re.findall(options, (ROOT / script[1]).read_text())
+            if script
+            else every_option(commands)
+        )
         missing = set(re.findall(options, code)) - {"--help", *known}
         assert not missing, f"{page.name}: {missing}"
 

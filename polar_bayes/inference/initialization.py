@@ -50,12 +50,17 @@ from polar_bayes.numerics.optimize import (
     find_modes,
     finite_sd,
     ignore_line_search_warnings,
+    likely_starts,
 )
 from polar_bayes.numerics.psis import numpy_generator
 from polar_bayes.observation.data import Observations
 from polar_bayes.progress import Progress
 
 STARTS = 16
+"""Number of searches for modes."""
+
+CANDIDATES = 16
+"""Number of prior draws per start; a sharp mode, such as that of a near mirror, needs so many."""
 
 HEAVY_MODE = 0.01
 """Smallest Laplace weight of a mode that chains must visit."""
@@ -370,8 +375,8 @@ class JointInitializer(AbstractInitializer):
     @override
     def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:
         potential = NumpyPotential(self.program.value_and_gradient, data, data.brightness.dtype)
-        starts = from_prior(self.program, key, STARTS, data)
-        modes = find_modes(potential, starts, progress)
+        drawn = from_prior(self.program, key, CANDIDATES * STARTS, data)
+        modes = find_modes(potential, likely_starts(potential, drawn, STARTS), progress)
         metadata = {
             "starts": modes.starts,
             "failures": modes.failures,

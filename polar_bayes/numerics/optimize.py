@@ -238,13 +238,22 @@ def conditional_mode(
     return start + factor @ found.x, float(found.fun)
 
 
+def likely_starts(potential: ValueAndGradient, drawn: np.ndarray, count: int) -> np.ndarray:
+    """Return the likeliest of many draws, half of the starts, and the first of the others."""
+    order = np.argsort([finite_potential(potential)(z)[0] for z in drawn], kind="stable")
+    half = min(count, len(drawn)) // 2
+    return drawn[np.concatenate([order[:half], np.sort(order[half:])[: count - half]])]
+
+
 def distinct_modes(ends: list[Optimum]) -> Modes | None:
-    """Return one end per mode; if no search converged, all ends within one sd of a mode."""
-    near = [end for end in ends if end.decrement < 1.0]
-    converged = [end for end in near if end.status is ModeStatus.OK]
+    """Return one end per mode, of all ends within one sd of a mode."""
+    # The heaviest mode may be one where no search converges: a kink of the density, such as that
+    # of readings at their floor, leaves a gradient.
     modes: list[Optimum] = []
-    for end in sorted(converged or near, key=lambda end: -end.log_evidence):
-        if all(mode.distance(end.z) > SAME_MODE for mode in modes):
+    near = (end for end in ends if end.decrement < 1.0)
+    for end in sorted(near, key=lambda end: -end.log_evidence):
+        apart = (mode.distance(end.z) - mode.decrement - end.decrement for mode in modes)
+        if all(distance > SAME_MODE for distance in apart):
             modes.append(end)
     if not modes:
         return None
@@ -255,7 +264,7 @@ def distinct_modes(ends: list[Optimum]) -> Modes | None:
         weight=weight / weight.sum(),
         decrement=np.array([mode.decrement for mode in modes]),
         starts=len(ends),
-        failures=len(ends) - len(converged),
+        failures=sum(end.status is not ModeStatus.OK for end in ends),
     )
 
 

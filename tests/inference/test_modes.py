@@ -10,6 +10,7 @@ from polar_bayes.numerics.optimize import (
     central_difference_hessian,
     distinct_modes,
     find_mode,
+    likely_starts,
 )
 
 SPREAD = np.array([[0.5, 0.2], [0.2, 0.3]])
@@ -96,3 +97,30 @@ def test_the_order_of_the_starts_does_not_matter(seed: int) -> None:
     modes = distinct_modes([find_mode(potential, start) for start in starts])
     assert modes is not None
     np.testing.assert_allclose(modes.z, centers[::-1], atol=0.01)
+
+
+def test_a_search_that_ends_beside_the_heaviest_peak_counts() -> None:
+    # Where readings lie at their floor, a kink of the density leaves a gradient.
+    centers = np.array([[-6.0, 0.0], [6.0, 0.0]])
+    light = find_mode(mixture_potential(centers, np.array([0.01, 0.99])), centers[0])
+    beside = light._replace(
+        z=centers[1],
+        potential=light.potential - 5.0,
+        decrement=0.03,
+        status=ModeStatus.NOT_CONVERGED,
+    )
+    again = beside._replace(z=centers[1] + 0.1 * np.sqrt(np.diagonal(SPREAD)))
+    modes = distinct_modes([light, beside, again])
+    assert modes is not None
+    np.testing.assert_allclose(modes.z, centers[::-1], atol=0.01)
+    assert modes.failures == 2
+
+
+def test_half_of_the_starts_are_the_likeliest_draws() -> None:
+    drawn = np.random.default_rng(0).normal(size=(256, 2))
+    drawn[7] = np.nan
+    starts = likely_starts(normal_potential(np.array([2.0, 1.0])), drawn, 8)
+    values = [normal_potential(np.array([2.0, 1.0]))(z)[0] for z in drawn]
+    np.testing.assert_array_equal(starts[:4], drawn[np.argsort(values)[:4]])
+    others = [z for z in drawn[:8] if not (z == starts[:4]).all(axis=1).any()]
+    np.testing.assert_array_equal(starts[4:], others[:4])
