@@ -54,8 +54,8 @@ class Limits:
     replicates: int = 1000
     # Readings that the checks use; of more, evenly spaced ones.
     readings: int = 600
-    # Share of the replicates at full scale beyond which the checks leave a reading out.
-    saturated: float = 0.01
+    # Share of the replicates at zero or full scale beyond which the checks leave a reading out.
+    cut_off: float = 0.05
     # Stated errors within which a reading is no outlier, however little the others scatter.
     stated_errors: float = 3.0
     # Draws may give a reading more than all of the information about itself.

@@ -4,10 +4,14 @@ The residuals of the readings are compared with residuals of replicated readings
 drawn from the posterior predictive distribution, and refitted in the linear-Gaussian approximation:
 with C the posterior covariance of the noise-free readings and $\Sigma$ the covariance of the noise,
 
-$$ e = (I - C \Sigma^{-1}) \varepsilon $$
+$$ e = (I - C \Sigma^{-1}) (\varepsilon + \mu - \mu_0) $$
 
-is what remains of noise $\varepsilon$ after a fit. Without the refit the observed residuals, which
-the parameters have absorbed in part, would look too small compared with those of the replicates.
+is what remains after a fit of noise $\varepsilon$ and of readings $\mu$ that the prior expects at
+$\mu_0$. Its covariance is $\Sigma - C$, that of $R (R \varepsilon + m)$ in units of the noise, with
+$R = (I - C)^{1/2}$ and $m$ a posterior draw of the noise-free readings less their mean. Without the
+refit the observed residuals, which the parameters have absorbed in part, would look too small
+compared with those of the replicates; without the prior, too large where an uncertain set-up
+shifts all readings and they tell little of it.
 The same approximation tells the fit without reading i: with the leverage
 $h_i = C_{ii} / \Sigma_{ii}$ its residual is $e_i / (1 - h_i)$, whose standard deviation is
 $(1 - h_i)^{-1/2}$, and the mean of a parameter moves by its covariance with the noise-free reading
@@ -66,9 +70,10 @@ def residuals_of(fit: FitView) -> Residuals | None:
     observed = np.concatenate([v.observed for v in variables])
     readings = pd.concat([_readings(result, v) for v in variables], ignore_index=True)
     sd = noise.std(axis=0)
-    # Replicates of a reading near full scale are cut off there, and have no residuals of their own.
-    cut = np.concatenate([(v.predicted >= v.full_scale).mean(axis=0) for v in variables])
-    keep = np.flatnonzero((sd > 0.0) & (cut < LIMITS.saturated))
+    # Replicates of a reading near zero or full scale are cut off there, so the residual of one that
+    # lies there has the sign that its cut allows.
+    cut = np.concatenate([_cut_off(v) for v in variables])
+    keep = np.flatnonzero((sd > 0.0) & (cut < LIMITS.cut_off))
     keep = keep[:: max(1, -(-keep.size // LIMITS.readings))]
     if keep.size < 4 or len(noise) < 100:
         return None
@@ -76,8 +81,9 @@ def residuals_of(fit: FitView) -> Residuals | None:
     random = np.random.default_rng(0)
     pick = random.permutation(len(noise))[: LIMITS.replicates]
     centered = noise_free - noise_free.mean(axis=0)
-    covariance = centered.T @ centered / (len(centered) - 1)
-    replicated = noise[pick] - noise[pick] @ covariance
+    share, axes = np.linalg.eigh(centered.T @ centered / (len(centered) - 1))
+    root = (axes * np.sqrt(np.clip(1.0 - share, 0.0, None))) @ axes.T
+    replicated = (noise[pick] @ root + centered[pick]) @ root
     material = {s.label: s.draws.ravel() for s in fit.scalars if s.is_material}
     material = {n: x for n, x in material.items() if np.isfinite(x).all() and np.ptp(x) > 0.0}
     scores = np.array([(x - x.mean()) / x.std() for x in material.values()]).reshape(
@@ -96,6 +102,13 @@ def residuals_of(fit: FitView) -> Residuals | None:
         group=pd.factorize(readings["group"])[0][keep],
         labels=tuple(used["label"]),
     )
+
+
+def _cut_off(variable: FlatVariable) -> np.ndarray:
+    """Share of replicates of each reading that lie at the least value of its variable or beyond."""
+    least = variable.predicted.min()
+    at_least = (variable.predicted == least).mean(axis=0)
+    return at_least + (variable.predicted >= variable.full_scale).mean(axis=0)
 
 
 def _readings(result: xr.DataTree, variable: FlatVariable) -> pd.DataFrame:
@@ -132,7 +145,9 @@ def residual_findings(residuals: Residuals | None) -> dict[str, Finding]:
         "influence": _influence,
     }
     if residuals is None:
-        missing = Finding("not computed", sentence="The fit holds no predicted readings.")
+        missing = Finding(
+            "not computed", sentence="Fewer than four readings have residuals of their own."
+        )
         return dict.fromkeys(checks, missing)
     return {name: check(residuals) for name, check in checks.items()}
 
