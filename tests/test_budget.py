@@ -15,12 +15,12 @@ CODE = {
     "capture": 814,
     "cli": 1256,
     "design": 1086,
-    "diagnostics": 1783,
+    "diagnostics": 1790,
     "importers": 2109,
     "inference": 2711,
     "maps": 1705,
     "methods": 1226,
-    "numerics": 997,
+    "numerics": 998,
     "observation": 499,
     "physics": 2748,
     "reporting": 3310,
@@ -32,10 +32,10 @@ CODE = {
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25503,
+    "code": 25511,
     "classes": 337,
     "constants": 419,
-    "Any": 193,
+    "Any": 177,
     "longest function": 80,
 }
 """Limits of the whole package; the limit of `longest function` is in lines.

@@ -11,7 +11,7 @@ import dataclasses
 import fnmatch
 import math
 from collections.abc import Callable, Hashable, Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeGuard
 
 import numpy as np
 import xarray as xr
@@ -32,7 +32,7 @@ class Leaf(NamedTuple):
     """A type of JSON values: its name, and a test of values."""
 
     name: str
-    holds: Callable[[Any], bool]
+    holds: Callable[[object], bool]
 
 
 CHOSEN_BY = {
@@ -43,16 +43,16 @@ CHOSEN_BY = {
 }
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: object) -> TypeGuard[float]:
     is_real = isinstance(value, int | float | np.number) and not isinstance(value, bool)
     return is_real and not (isinstance(value, int) and abs(value) >= 2**64)
 
 
-def _is_finite(value: Any) -> bool:
+def _is_finite(value: object) -> TypeGuard[float]:
     return _is_number(value) and abs(value) < 2**64 and math.isfinite(value)
 
 
-def _is_pair(value: Any, holds: Callable[[Any], bool]) -> bool:
+def _is_pair(value: object, holds: Callable[[object], bool]) -> bool:
     return isinstance(value, list) and len(value) == 2 and all(map(holds, value))
 
 
@@ -82,7 +82,7 @@ EACH = "*"
 """Key that represents every key of a mapping that the specification does not name."""
 
 
-def _check_json(value: Any, spec: Spec, where: str) -> Problems:
+def _check_json(value: object, spec: Spec, where: str) -> Problems:
     """Yield the places at which a JSON value violates its specification."""
     if isinstance(spec, Leaf):
         if not spec.holds(value):
@@ -99,7 +99,7 @@ def _check_json(value: Any, spec: Spec, where: str) -> Problems:
         yield where, f"it is {value!r}, not a mapping"
 
 
-def _check_mapping(value: Mapping[str, Any], spec: Mapping[str, Spec], where: str) -> Problems:
+def _check_mapping(value: Mapping[str, object], spec: Mapping[str, Spec], where: str) -> Problems:
     for key in spec:
         if key != EACH and not key.endswith("?") and key not in value:
             yield f"{where}.{key}", "it is missing"

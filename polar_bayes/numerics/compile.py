@@ -19,7 +19,7 @@ from typing import Any
 import cachetools
 import jax
 from jax.experimental.compilation_cache import compilation_cache
-from jax.stages import Compiled, Lowered
+from jax.stages import Compiled, Lowered, Wrapped
 
 from polar_bayes.errors import FitError
 from polar_bayes.numerics.kept_programs import KeptProgram, cache_hits, kept_program
@@ -90,7 +90,7 @@ def keep_compiled_programs() -> None:
     compilation_cache.reset_cache()  # JAX looks for the folder once, when it first compiles
 
 
-def compiled(function: Callable) -> Any:
+def compiled(function: Callable) -> Wrapped:
     """Wrap a function in `jax.jit`, with `COMPILER_OPTIONS` on a CPU."""
     keep_compiled_programs()
     flags = os.environ.get("XLA_FLAGS", "")
@@ -161,26 +161,27 @@ def _trace_and_compile(lower: Callable[[], Lowered], double: bool) -> Compiled:
 class _Compilation:
     """A program that is kept on the disk or lowered, made once, by the first thread that asks."""
 
-    def __init__(self, compile_now: Callable[[], Any], kept: KeptProgram | None) -> None:
-        self._compile_now: Callable[[], Any] | None = compile_now
+    def __init__(self, compile_now: Callable[[], Compiled], kept: KeptProgram | None) -> None:
+        self._compile_now = compile_now
         self._kept = kept
-        self._compiled: Any = None
-        self._program: Callable | None = None
+        self._compiled: Compiled | None = None
+        self._program: Compiled | None = None
         self._lock = threading.Lock()
 
-    def result(self) -> Callable:
+    def result(self) -> Compiled:
         # A thread does not wait for the queue of `_COMPILER_THREAD`, which holds programs of other
         # fits: what is still in the queue is compiled by the thread that needs it.
-        if self._program is None:
-            with self._lock:
-                if self._compile_now is not None:
-                    self._compiled = self._make(self._compile_now)
-                    self._compile_now = None  # it may hold readings
-                check_memory(bytes_of(self._compiled))
-                self._program = self._compiled
+        if self._program is not None:
+            return self._program
+        with self._lock:
+            if self._compiled is None:
+                self._compiled = self._make(self._compile_now)
+                del self._compile_now  # it may hold readings
+            check_memory(bytes_of(self._compiled))
+            self._program = self._compiled
         return self._program
 
-    def _make(self, compile_now: Callable[[], Any]) -> Any:
+    def _make(self, compile_now: Callable[[], Compiled]) -> Compiled:
         if self._kept is not None and (found := self._kept.load()) is not None:
             return found
         hits = cache_hits()
@@ -191,7 +192,7 @@ class _Compilation:
         return found
 
 
-def bytes_of(program: Any) -> int:
+def bytes_of(program: Compiled) -> int:
     """Return the memory that a run of a program takes; 0 if the backend reports nothing."""
     analysis = program.memory_analysis()
     if analysis is None:

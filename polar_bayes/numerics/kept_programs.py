@@ -23,6 +23,8 @@ from typing import Any
 
 import jax
 from jax.experimental import serialize_executable
+from jax.stages import Compiled
+from jaxtyping import ArrayLike
 
 from polar_bayes.namespace import IMPORTED
 from polar_bayes.paths import atomic_write, compiled_folder
@@ -79,7 +81,7 @@ class KeptProgram:
         run.__name__ = "_".join([name, *(each[:8] for each in own)])
         return run
 
-    def load(self) -> Callable | None:
+    def load(self) -> Compiled | None:
         """The program; None where it is damaged, or gone by now."""
         try:
             program, result = pickle.loads(self._path.read_bytes())
@@ -95,7 +97,7 @@ class KeptProgram:
             self._path.unlink(missing_ok=True)
             return None
 
-    def save(self, compiled: Any) -> None:
+    def save(self, compiled: Compiled) -> None:
         """Keep a program, where it can be: one that holds arrays, or whose result cannot."""
         with contextlib.suppress(Exception):
             program, _, result = serialize_executable.serialize(compiled)
@@ -123,7 +125,7 @@ def kept_program(key: str, arguments: tuple) -> KeptProgram | None:
     return KeptProgram(folder / "programs" / environment / _digest(words), arguments)
 
 
-def _described(leaf: Any) -> str:
+def _described(leaf: ArrayLike | jax.ShapeDtypeStruct) -> str:
     like = leaf if isinstance(leaf, jax.ShapeDtypeStruct) else jax.typeof(leaf)
     return f"{like.dtype}{like.shape}{like.weak_type}"
 
