@@ -93,7 +93,7 @@ def verdict(fit: FitView) -> Verdict:
     against = criticism["sentence"].groupby(criticism["level"], sort=False).agg(list)
     cautions = (
         *_approximation_cautions(fit),
-        *_mode_cautions(provenance),
+        *_modes(provenance, drawn=False),
         *_tail_cautions(fit),
         *_estimate_cautions(fit),
         *_masked(provenance.get("counts", {})),
@@ -106,6 +106,7 @@ def verdict(fit: FitView) -> Verdict:
     faults = tuple(against.get("problem", []))
     notes = (
         *against.get("note", []),
+        *_modes(provenance, drawn=True),
         *_chain_notes(fit),
         *_edges(provenance.get("counts", {}), many=False),
         *budget_sentences(fit),
@@ -337,24 +338,27 @@ def _corrections(weights: np.ndarray, found: Sequence[Scalar]) -> Iterator[str]:
         )
 
 
-def _mode_cautions(provenance: Provenance) -> Iterator[str]:
+def _modes(provenance: Provenance, *, drawn: bool) -> Iterator[str]:
+    """Another mode, of which weighted draws tell that the draws have their share, or not."""
     weights = (provenance.get("modes") or {}).get("weights", [])
-    # Weighted draws of all modes have told whether chains have their tails.
-    compared = (provenance.get("tails") or {}).get("pareto_k", math.inf) <= MAX_PARETO_K
-    if len(weights) > 1 and weights[1] > LIMITS.second_mode and not compared:
-        heaviest = ", and only the heaviest is described here; use method='nuts', or "
-        effects = {
-            "laplace": heaviest,
-            "variational": heaviest,
-            "importance": ", and the draws are of both; a mean may lie between them; ",
-            "nuts": ", and chains may not have visited them in proportion; compare chains in the "
-            "rank plot, or ",
-        }
-        effect = effects.get(str(provenance.get("method", "laplace")), "; ")
-        yield (
-            f"The posterior has another mode, of weight {weights[1]:.2g}: another explanation of "
-            f"the readings exists{effect}add views that tell them apart."
-        )
+    weighted = provenance if provenance.get("method") == "importance" else provenance.get("tails")
+    is_drawn = ((weighted or {}).get("pareto_k") or math.inf) <= MAX_PARETO_K
+    if len(weights) < 2 or weights[1] <= LIMITS.second_mode or drawn != is_drawn:
+        return
+    heaviest = ", and only the heaviest is described here; use method='nuts', or "
+    effects = {
+        "laplace": heaviest,
+        "variational": heaviest,
+        "nuts": ", and chains may not have visited them in proportion; compare chains in the "
+        "rank plot, or ",
+    }
+    effect = effects.get(str(provenance.get("method", "laplace")), "; ")
+    if drawn:
+        effect = ", and the draws are of both; a mean may lie between them; "
+    yield (
+        f"The posterior has another mode, of weight {weights[1]:.2g}: another explanation of "
+        f"the readings exists{effect}add views that tell them apart."
+    )
 
 
 def _tail_cautions(fit: FitView) -> Iterator[str]:

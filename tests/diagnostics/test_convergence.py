@@ -232,6 +232,7 @@ def test_another_mode_is_no_caution_where_weighted_draws_of_it_agree_with_the_ch
     tails = {"pareto_k": 0.4, "ess": 900.0, "shares": {}}
     tree = edit_provenance(make_result(), modes=modes, tails=tails)
     assert not verdict(tree).cautions
+    assert "the draws are of both" in verdict(tree).findings[0]
     unknown = edit_provenance(tree, tails=tails | {"pareto_k": 0.9})
     assert "another mode, of weight 0.2" in verdict(unknown).cautions[0]
 
