@@ -196,6 +196,9 @@ class Beta(dist.Beta):
 
     @override
     def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Array:
+        support = self.support
+        if isinstance(support, ByNormalScore):  # compiles in a moment, a sampler by rejection not
+            return support.transform(jax.random.normal(key, self.shape(sample_shape)))
         return dist.Beta(self.concentration1, self.concentration0).sample(key, sample_shape)
 
     @override

@@ -8,10 +8,18 @@ import numpy as np
 import pytest
 from cases import each
 from numpyro import distributions as dist
+from scipy import stats
 
 from polar_bayes.errors import FitError
 from polar_bayes.observation.links import noise_parameters
-from polar_bayes.priors import PRIORS, RANGES, describe_prior, resolve_priors, support_bounds
+from polar_bayes.priors import (
+    PRIORS,
+    RANGES,
+    Beta,
+    describe_prior,
+    resolve_priors,
+    support_bounds,
+)
 from polar_bayes.setups import SETUPS
 
 KEY = jax.random.key(7)
@@ -92,6 +100,12 @@ def test_the_tables_beta_is_numpyros():
 
 
 # --- replacing a row ------------------------------------------------------------------------------
+
+
+@each("shapes", [(1.0, 20.0), (10.0, 1.0), (2.0, 2.0)])
+def test_draws_of_beta_have_its_distribution(shapes):
+    draws = Beta(*shapes).sample(KEY, (4000,))
+    assert stats.kstest(draws, stats.beta(*shapes).cdf).pvalue > 1e-4  # false alarms: 1 in 1e4
 
 
 def test_an_override_replaces_its_row_and_no_other():

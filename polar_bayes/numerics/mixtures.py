@@ -130,7 +130,7 @@ def fit_t(
 # --- Mixtures of Student t distributions ----------------------------------------------------------
 
 
-DEGREES_OF_FREEDOM = 8.0
+DEGREES_OF_FREEDOM = 8
 """Degrees of freedom of each component: longer tails than most posteriors' bound the weights."""
 
 EM_STEPS = 15
@@ -206,12 +206,14 @@ def fit_mixture(
 
 def draw_mixture(mixture: Mixture, count: int, key: Array) -> Float[Array, "draw size"]:
     """Draw from the mixture, with components chosen by systematic resampling."""
-    key_which, key_normal, key_tail = jax.random.split(key, 3)
+    key_which, key_normal = jax.random.split(key)
     share = jnp.exp(mixture.log_share)
     which = systematic_resample(share, count, jax.random.uniform(key_which))
+    # Squares of normal draws: a sampler of chi-squared would compile for seconds.
     dtype, freedom = mixture.mean.dtype, DEGREES_OF_FREEDOM
-    tail = jax.random.gamma(key_tail, 0.5 * freedom, (count, 1), dtype) * 2.0 / freedom
-    noise = jax.random.normal(key_normal, (count, mixture.mean.shape[-1]), dtype) / jnp.sqrt(tail)
+    drawn = jax.random.normal(key_normal, (count, freedom + mixture.mean.shape[-1]), dtype)
+    tail = jnp.mean(drawn[:, :freedom] ** 2, axis=1, keepdims=True)
+    noise = drawn[:, freedom:] / jnp.sqrt(tail)
     x = mixture.mean[which] + jnp.einsum("dij,dj->di", mixture.scale[which], noise)
     return mixture.center + x @ mixture.half.T
 

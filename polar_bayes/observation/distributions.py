@@ -2,7 +2,7 @@
 
 `MeanConcentrationBeta` is the Beta distribution by mean and concentration; its log density is
 written as a divergence plus Stirling remainders, so that concentrations of 1e8 cancel nothing.
-`SensorStudentT` is Student's t, censored at zero and at full scale.
+`StudentT` is drawn without rejection; `SensorStudentT` is it, censored at zero and at full scale.
 """
 
 import functools
@@ -130,6 +130,18 @@ def _laguerre(count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.polynomial.laguerre.laggauss(count)
 
 
+class StudentT(dist.StudentT):
+    """Student's t, drawn by Bailey's polar method (1994, Mathematics of Computation 62, 779)."""
+
+    @override
+    def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Array:
+        # NumPyro's own divides by a draw of chi-squared, whose rejection compiles for a second.
+        shape = 2, *self.shape(sample_shape)
+        share, turn = jax.random.uniform(key, shape, jnp.result_type(self.scale, 1.0))
+        square = self.df * jnp.expm1(-2.0 / self.df * jnp.log1p(-share))
+        return self.loc + self.scale * jnp.sqrt(square) * jnp.cos(2.0 * math.pi * turn)
+
+
 class SensorStudentT(dist.Distribution):
     r"""Student's t noise, censored at zero and at full scale.
 
@@ -168,7 +180,7 @@ class SensorStudentT(dist.Distribution):
 
     @override
     def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Array:
-        noise = dist.StudentT(self.degrees_of_freedom, self.location, self.scale)
+        noise = StudentT(self.degrees_of_freedom, self.location, self.scale)
         return jnp.clip(noise.sample(key, sample_shape), 0.0, self.full_scale)
 
     @override

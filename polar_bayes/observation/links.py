@@ -25,7 +25,11 @@ from numpyro import distributions as dist
 
 from polar_bayes.errors import FitError
 from polar_bayes.observation.data import Observations
-from polar_bayes.observation.distributions import MeanConcentrationBeta, SensorStudentT
+from polar_bayes.observation.distributions import (
+    MeanConcentrationBeta,
+    SensorStudentT,
+    StudentT,
+)
 from polar_bayes.physics.geometry import cos_degrees
 from polar_bayes.repr_html import HTMLRepr
 
@@ -352,7 +356,7 @@ class StokesLink(AbstractLink):
             return dist.Normal(location, scale)
         # As a bare number it would become double precision whatever the rest of the program is.
         freedom = jnp.asarray(self.degrees_of_freedom, jnp.result_type(scale))
-        return dist.StudentT(freedom, location, scale)
+        return StudentT(freedom, location, scale)
 
     def _brightness(self, prediction: Prediction, data: Observations, noise: Noise) -> PerView:
         """Return the light of each view over full scale, which sets its noise."""

@@ -17,6 +17,7 @@ from scipy import stats
 from polar_bayes.observation.distributions import (
     MeanConcentrationBeta,
     SensorStudentT,
+    StudentT,
     log_survival,
 )
 
@@ -315,6 +316,13 @@ def test_sensor_draws_have_the_mean_and_variance_of_student_t_far_from_the_stops
     assert_moments(
         np.asarray(drawn(distribution, 2)), np.asarray(distribution.mean), 0.002**2 * 5.0 / 3.0
     )
+
+
+@each("freedom", [1.0, 4.0, 30.0])
+def test_draws_of_student_t_have_its_distribution(freedom: float) -> None:
+    draws = drawn(StudentT(freedom, 0.5, 0.2), 4)
+    # 1 in 1e4 of right samplers would fail, of three degrees of freedom 3 in 1e4.
+    assert stats.kstest(draws, stats.t(freedom, 0.5, 0.2).cdf).pvalue > 1e-4
 
 
 def test_sensor_draws_pile_up_at_the_stops_as_often_as_stated():
