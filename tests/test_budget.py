@@ -15,7 +15,7 @@ CODE = {
     "capture": 814,
     "cli": 1256,
     "design": 1086,
-    "diagnostics": 1794,
+    "diagnostics": 1795,
     "importers": 2109,
     "inference": 2711,
     "maps": 1705,
@@ -32,7 +32,7 @@ CODE = {
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25526,
+    "code": 25527,
     "classes": 338,
     "constants": 419,
     "Any": 177,

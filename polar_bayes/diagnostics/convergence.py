@@ -342,7 +342,8 @@ def _modes(provenance: Provenance, *, drawn: bool) -> Iterator[str]:
     """Another mode, of which weighted draws tell that the draws have their share, or not."""
     weights = (provenance.get("modes") or {}).get("weights", [])
     weighted = provenance if provenance.get("method") == "importance" else provenance.get("tails")
-    is_drawn = ((weighted or {}).get("pareto_k") or math.inf) <= MAX_PARETO_K
+    pareto_k = (weighted or {}).get("pareto_k")
+    is_drawn = pareto_k is not None and pareto_k <= MAX_PARETO_K
     if len(weights) < 2 or weights[1] <= LIMITS.second_mode or drawn != is_drawn:
         return
     heaviest = ", and only the heaviest is described here; use method='nuts', or "

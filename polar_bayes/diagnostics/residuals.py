@@ -105,10 +105,10 @@ def residuals_of(fit: FitView) -> Residuals | None:
 
 
 def _cut_off(variable: FlatVariable) -> np.ndarray:
-    """Share of replicates of each reading that lie at the least value of its variable or beyond."""
-    least = variable.predicted.min()
-    at_least = (variable.predicted == least).mean(axis=0)
-    return at_least + (variable.predicted >= variable.full_scale).mean(axis=0)
+    """Share of the replicates of each reading that lie at an end of the range of its variable."""
+    least, largest = variable.predicted.min(), variable.predicted.max()
+    is_high = variable.predicted >= min(largest, variable.full_scale)
+    return (is_high | (variable.predicted == least)).mean(axis=0)
 
 
 def _readings(result: xr.DataTree, variable: FlatVariable) -> pd.DataFrame:
