@@ -27,7 +27,7 @@ CODE = {
     "scenes": 1759,
     "own files": 1574,
     "models": 320,
-    "tests": 24100,
+    "tests": 24097,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 

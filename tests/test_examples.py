@@ -170,15 +170,12 @@ def every_option(command: click.Command) -> set[str]:
 
 @of_every_page
 def test_the_options_that_a_page_names_exist(page: Path) -> None:
-    options = r"(?<!\S)--[a-z][a-z-]*"
+    option = r"--[a-z][a-z-]*"
     for code in inline(page):
         script = re.match(r"python (\S+\.py)", code)
-        known = (
-            re.findall(options, (ROOT / script[1]).read_text())
-            if script
-            else every_option(commands)
-        )
-        missing = set(re.findall(options, code)) - {"--help", *known}
+        own = every_option(commands)
+        known = re.findall(option, (ROOT / script[1]).read_text()) if script else own
+        missing = set(re.findall(rf"(?<!\S){option}", code)) - {"--help", *known}
         assert not missing, f"{page.name}: {missing}"
 
 
