@@ -560,6 +560,8 @@ def main() -> None:
     print("with a problem:", wilson(failed, len(lines)))
     against = sum(line.get("against", 0) > 0 for line in lines)
     print("with a problem of the model, not of the method:", wilson(against, len(lines)))
+    flagged = sum(line["problems"] + line["cautions"] > 0 for line in lines)
+    print("with a problem or a caution:", wilson(flagged, len(lines)))
     print("silent and wrong:", wilson(silent, len(lines)))
     held = pd.DataFrame([line.get("holds", {}) for line in lines])
     for name, column in held.items():

@@ -197,7 +197,7 @@ class Beta(dist.Beta):
     @override
     def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Array:
         support = self.support
-        if isinstance(support, ByNormalScore):  # compiles in a moment, a sampler by rejection not
+        if isinstance(support, ByNormalScore):  # a sampler by rejection compiles for a second
             return support.transform(jax.random.normal(key, self.shape(sample_shape)))
         return dist.Beta(self.concentration1, self.concentration0).sample(key, sample_shape)
 

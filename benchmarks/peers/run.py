@@ -39,6 +39,7 @@ from one_material import SCENE, layout
 from posterior import CHAINS, Posterior
 
 import polar_bayes as pb
+from polar_bayes.methods.method import flatten
 from polar_bayes.numerics.mcse import measure, standard_errors
 
 PEERS = (
@@ -55,20 +56,10 @@ LONG = 20_000
 """Number of draws of the reference, per chain."""
 
 
-def scalars(parameters: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Draws (chain, draw) of each number; those of several colors are numbered."""
-    return {
-        name if drawn.ndim == 2 else f"{name}[{i}]": each
-        for name, drawn in parameters.items()
-        for i, each in enumerate(np.moveaxis(drawn.reshape(*drawn.shape[:2], -1), -1, 0))
-    }
-
-
-def judge(found: Any, reference: dict[str, list[float]]) -> dict[str, Any]:
+def judge(found: Any, reference: dict[str, Any]) -> dict[str, Any]:
     """Return diagnostics and errors of the draws of one round."""
-    rows, all_drawn = [], scalars(found.parameters)
-    for name, (mean, sd, _) in reference.items():
-        drawn = all_drawn[name]
+    rows, draws = [], flatten({name: found.parameters[name] for name in reference["names"]})
+    for drawn, (mean, sd, _) in zip(draws, reference["numbers"], strict=True):
         weights = np.ones(drawn.shape) if found.weights is None else found.weights
         own = np.average(drawn, weights=weights)
         own_sd = np.sqrt(np.average((drawn - own) ** 2, weights=weights))
@@ -77,7 +68,7 @@ def judge(found: Any, reference: dict[str, list[float]]) -> dict[str, Any]:
     told["evaluations"] = found.evaluations
     if found.worth is not None:
         return told | {"worth": found.worth, "r_hat": None, "done": found.worth >= LEAST_WORTH}
-    bulk, tail, r_hat = measure(np.stack([all_drawn[name] for name in reference]))
+    bulk, tail, r_hat = measure(draws)
     worth, worst = float(min(bulk.min(), tail.min())), float(r_hat.max())
     done = worth >= LEAST_WORTH and worst <= LARGEST_R_HAT
     return told | {"worth": worth, "r_hat": worst, "done": done}
@@ -102,17 +93,17 @@ def sample_one(name: str, folder: Path, began: float, limit: float, colors: int)
     print(json.dumps(told, default=float))
 
 
-def reference_of(folder: Path, colors: int) -> dict[str, list[float]]:
+def reference_of(folder: Path, colors: int) -> dict[str, Any]:
     """The capture, and a long run: mean, sd and Monte Carlo error of the mean of each number."""
     capture = layout() if colors == 1 else pb.simulate("plastic", seed=0)
     pb.save_capture(capture, folder / "capture.nc")
     method = pb.methods.Nuts(draws=LONG, most_draws=LONG, ess=1.0)
     found = pb.fit(capture, method=method, scene=SCENES[colors], seed=99)
-    draws = {name: found["posterior"][name].values for name in found["prior"].data_vars}
-    long = {}
-    for name, drawn in scalars(draws).items():
-        sd, (error, _) = float(drawn.std()), standard_errors(drawn[None])
-        long[name] = [float(drawn.mean()), sd, sd * float(error[0])]
+    names = list(found["prior"].data_vars)
+    draws = flatten({name: found["posterior"][name].values for name in names})
+    sd = draws.std(axis=(1, 2))
+    numbers = np.stack([draws.mean(axis=(1, 2)), sd, sd * standard_errors(draws)[0]], axis=1)
+    long = {"names": names, "numbers": numbers.tolist()}
     (folder / "reference.json").write_text(json.dumps(long))
     return long
 
@@ -138,7 +129,7 @@ def main(names: list[str], limit: float, colors: int) -> None:
     with tempfile.TemporaryDirectory() as path:
         folder = Path(path)
         long = reference_of(folder, colors)
-        error = max(row[2] / row[1] for row in long.values())
+        error = max(own / sd for _, sd, own in long["numbers"])
         print(f"reference: Monte Carlo error of the means at most {error:.4f} sd")
         print(f"{'':<12}{'cold s':>8} {'warm s':>8} {'evaluated':>9}{'ESS':>8}{'R-hat':>8}", end="")
         print(f"{'ESS/s':>10}{'mean':>8}{'sd':>8}   * its time was up", flush=True)

@@ -341,21 +341,19 @@ def _corrections(weights: np.ndarray, found: Sequence[Scalar]) -> Iterator[str]:
 def _modes(provenance: Provenance, *, drawn: bool) -> Iterator[str]:
     """Another mode, of which weighted draws tell that the draws have their share, or not."""
     weights = (provenance.get("modes") or {}).get("weights", [])
-    weighted = provenance if provenance.get("method") == "importance" else provenance.get("tails")
-    pareto_k = (weighted or {}).get("pareto_k")
+    method = str(provenance.get("method", "laplace"))
+    pareto_k = (provenance if method in WEIGHTED else provenance.get("tails") or {}).get("pareto_k")
     is_drawn = pareto_k is not None and pareto_k <= MAX_PARETO_K
     if len(weights) < 2 or weights[1] <= LIMITS.second_mode or drawn != is_drawn:
         return
-    heaviest = ", and only the heaviest is described here; use method='nuts', or "
-    effects = {
-        "laplace": heaviest,
-        "variational": heaviest,
-        "nuts": ", and chains may not have visited them in proportion; compare chains in the "
-        "rank plot, or ",
-    }
-    effect = effects.get(str(provenance.get("method", "laplace")), "; ")
-    if drawn:
+    effect = "; "
+    if is_drawn:
         effect = ", and the draws are of both; a mean may lie between them; "
+    elif method == "nuts":
+        effect = ", and chains may not have visited them in proportion; compare chains in the "
+        effect += "rank plot, or "
+    elif method in APPROXIMATIONS:
+        effect = ", and only the heaviest is described here; use method='nuts', or "
     yield (
         f"The posterior has another mode, of weight {weights[1]:.2g}: another explanation of "
         f"the readings exists{effect}add views that tell them apart."

@@ -54,7 +54,7 @@ class Limits:
     replicates: int = 1000
     # Readings that the checks use; of more, evenly spaced ones.
     readings: int = 600
-    # Share of the replicates at zero or full scale beyond which the checks leave a reading out.
+    # Share of the replicates at an end of their range beyond which the checks leave a reading out.
     cut_off: float = 0.05
     # Stated errors within which a reading is no outlier, however little the others scatter.
     stated_errors: float = 3.0

@@ -145,9 +145,8 @@ def residual_findings(residuals: Residuals | None) -> dict[str, Finding]:
         "influence": _influence,
     }
     if residuals is None:
-        missing = Finding(
-            "not computed", sentence="Fewer than four readings have residuals of their own."
-        )
+        sentence = "The fit holds too few predicted readings that lie within their range."
+        missing = Finding("not computed", sentence=sentence)
         return dict.fromkeys(checks, missing)
     return {name: check(residuals) for name, check in checks.items()}
 

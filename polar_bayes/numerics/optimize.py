@@ -238,10 +238,15 @@ def conditional_mode(
     return start + factor @ found.x, float(found.fun)
 
 
+def by_likelihood(potential: ValueAndGradient, drawn: np.ndarray) -> np.ndarray:
+    """Return the indices of draws, the likeliest first."""
+    guarded = finite_potential(potential)
+    return np.argsort([guarded(z)[0] for z in drawn], kind="stable")
+
+
 def likely_starts(potential: ValueAndGradient, drawn: np.ndarray, count: int) -> np.ndarray:
     """Return the likeliest of many draws, half of the starts, and the first of the others."""
-    order = np.argsort([finite_potential(potential)(z)[0] for z in drawn], kind="stable")
-    half = min(count, len(drawn)) // 2
+    order, half = by_likelihood(potential, drawn), min(count, len(drawn)) // 2
     return drawn[np.concatenate([order[:half], np.sort(order[half:])[: count - half]])]
 
 

@@ -254,13 +254,12 @@ class Scene(HTMLRepr):
             parameters = {**parameters, "refractive_index": index}
         layers = () if self.coat is None else self.coat.layers(parameters, geometry.wavelength)
         stack = Stack(parameters["refractive_index"], layers)
-        surface = self.surface.light(parameters, geometry, stack)
-        if self.subsurface is None or self.mixing is None:
-            return _computed_once(Light(*jnp.broadcast_arrays(*surface)))
-        interface = Interface(self.surface, stack)
-        subsurface = self.subsurface.light(parameters, geometry, interface)
-        mixture = self.mixing.mix(parameters["subsurface_fraction"], surface, subsurface)
-        return _computed_once(Light(*jnp.broadcast_arrays(*mixture)))
+        light = self.surface.light(parameters, geometry, stack)
+        if self.subsurface is not None and self.mixing is not None:
+            interface = Interface(self.surface, stack)
+            subsurface = self.subsurface.light(parameters, geometry, interface)
+            light = self.mixing.mix(parameters["subsurface_fraction"], light, subsurface)
+        return _computed_once(Light(*jnp.broadcast_arrays(*light)))
 
     def _neutral_quantities(self) -> dict[str, float]:
         known = (term for term in self.terms if isinstance(term, AbstractInputQuantity))
@@ -289,9 +288,9 @@ class Scene(HTMLRepr):
         return {name: jnp.asarray(parameters[name], dtype)[..., None] for name in needed}
 
 
-def _computed_once[T](readings: T) -> T:
-    """The same values; XLA's CPU compiler would fuse the optics into each of their readers."""
-    return jax.lax.optimization_barrier(readings)
+def _computed_once[T](values: T) -> T:
+    """The same values; XLA's CPU compiler would fuse the optics into all that reads them."""
+    return jax.lax.optimization_barrier(values)
 
 
 class UnsuitablePartsError(SceneError):

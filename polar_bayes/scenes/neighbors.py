@@ -43,6 +43,7 @@ from polar_bayes.numerics.optimize import (
     DifferencedPotential,
     Modes,
     ValueAndGradient,
+    by_likelihood,
     find_modes,
     symmetrize,
 )
@@ -291,12 +292,13 @@ def _with_scene(
 
     starts = placed(starts, {name: np.median(drawn[name], axis=0) for name in own})
     if len(own) > 1:  # fringes have many modes: the likeliest of some draws, the index with them
-        others = [
-            placed(starts[0], {name: each[number] for name, each in drawn.items()})
-            for number in range(OTHER_STARTS)
-        ]
-        others.sort(key=lambda z: potential(z)[0])
-        starts = np.vstack([starts, *others[:OTHER_SEARCHES]])
+        others = np.stack(
+            [
+                placed(starts[0], {name: each[number] for name, each in drawn.items()})
+                for number in range(OTHER_STARTS)
+            ]
+        )
+        starts = np.vstack([starts, others[by_likelihood(potential, others)[:OTHER_SEARCHES]]])
     return potential, starts, covariance
 
 

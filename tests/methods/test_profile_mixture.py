@@ -37,10 +37,11 @@ def coordinates_at(density, z: np.ndarray, covariance: np.ndarray, axes: np.ndar
     )
 
 
-def weighted(peak: Coordinates) -> tuple[np.ndarray, np.ndarray, float]:
-    """Draws of the mixture (draw, 2), their weights, and how many these are worth."""
+def weighted(peak: Coordinates, *more: list[float]) -> tuple[np.ndarray, np.ndarray, float]:
+    """Draws of the mixture and more (draw, 2), their weights, and how many these are worth."""
     mixture = profile_mixture(peak)
     draws = jax.jit(draw_mixture, static_argnums=1)(mixture, DRAWS, jax.random.key(0))
+    draws = np.concatenate([draws, np.reshape(more, (-1, 2))])
     proposed, draws = np.asarray(jax.jit(log_density)(mixture, draws)), np.asarray(draws)
     weights, _ = smooth((peak.log_density(draws) - proposed)[None])
     return draws, weights[0], float(weighted_ess(weights)[0])
@@ -54,9 +55,14 @@ def test_an_arm_gets_draws_and_its_weight() -> None:
     variance = SHARE * NARROW**2 + (1.0 - SHARE) * (WIDE**2 + FAR**2) - mean**2
     assert abs(weights @ draws[:, 0] - mean) < 4.0 * np.sqrt(variance / effective)
     # The mode alone leaves most of the arm without draws.
-    draws, weights, effective = weighted(coordinates_at(arm, z, covariance, np.arange(0)))
+    alone = coordinates_at(arm, z, covariance, np.arange(0))
+    draws, weights, effective = weighted(alone)
     assert (draws[:, 0] > FAR).all()
     assert abs(weights @ draws[:, 0] - mean) > 4.0 * np.sqrt(variance / effective)
+    # One that fell a sd beyond its center by chance would take the worth of most of them.
+    there = FAR - WIDE
+    *_, effective = weighted(alone, [there, BEND * there**2])
+    assert effective < 0.05 * DRAWS
 
 
 def test_every_mode_of_weight_gets_draws() -> None:
