@@ -14,7 +14,7 @@ CODE = {
     "calibration": 1035,
     "capture": 814,
     "cli": 1256,
-    "design": 1087,
+    "design": 1088,
     "diagnostics": 1792,
     "importers": 2109,
     "inference": 2711,
@@ -22,17 +22,17 @@ CODE = {
     "methods": 1226,
     "numerics": 1001,
     "observation": 506,
-    "physics": 2747,
+    "physics": 2749,
     "reporting": 3310,
     "scenes": 1760,
     "own files": 1574,
     "models": 320,
-    "tests": 24102,
+    "tests": 24118,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25527,
+    "code": 25530,
     "classes": 338,
     "constants": 419,
     "Any": 177,

@@ -57,7 +57,8 @@ def information(distribution: dist.Distribution) -> FisherInformation:
     """Return the Fisher information of one reading about its distribution's parameters."""
     shape = distribution.batch_shape
     distribution = unwrapped(distribution)
-    formula = _FORMULAS.get(type(distribution))
+    kinds = (kind for kind in _FORMULAS if isinstance(distribution, kind))
+    formula = _FORMULAS.get(next(kinds, object))
     if formula is None:
         what = f"the Fisher information of {type(distribution).__name__} is not known"
         hint = f"use a link that gives one of {', '.join(f.__name__ for f in _FORMULAS)}"

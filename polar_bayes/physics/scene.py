@@ -237,6 +237,8 @@ class Scene(HTMLRepr):
         return self._with_terms(tuple(others))
 
     def _with_terms(self, terms: tuple[AbstractInstrumentTerm, ...]) -> "Scene":
+        if terms == self.terms:
+            return self  # with what a scene carries besides its parts: how it was chosen
         return dataclasses.replace(self, instrument=Instrument(terms) if terms else None)
 
     def _optics(self, parameters: Parameters, geometry: Geometry) -> Light:

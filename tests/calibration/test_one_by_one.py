@@ -110,7 +110,7 @@ def test_chains_that_are_too_short_are_ranked_and_not_trusted(capture: xr.Datase
     assert np.isfinite(found["prior_sbc"]["level"]).all()
     said = pb.verdict(found).sentences
     assert "20 of 20 fits: not trusted." in said
-    assert any("the ranks judge the method, not the model" in sentence for sentence in said)
+    assert any("the ranks test the method, not the model" in sentence for sentence in said)
 
 
 @pytest.mark.thorough

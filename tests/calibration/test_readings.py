@@ -114,7 +114,10 @@ def test_readings_are_judged_by_themselves() -> None:
         )
         assert pb.calibration.is_calibrated(pb.summary(tree))
     said = pb.verdict(good).sentences
-    assert "Readings (dop, intensity; fresh ones and ones left out) pass a joint test" in said[1]
+    assert (
+        "Readings (dop, intensity; fresh ones and ones left out) pass a separate joint test"
+        in said[1]
+    )
     said = pb.verdict(bad).sentences
     assert " fail a separate joint test that a right model fails 5%" in said[1]
     assert "dop, fresh: predictions are too narrow (p = 0.0001)." in said

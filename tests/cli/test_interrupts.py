@@ -129,7 +129,7 @@ def test_a_signal_ends_every_long_command_at_any_moment(
     assert said.startswith("polar-bayes: stopped")
     assert all(re.match(r"\d+ s: ", line) for line in progress)
     if name == "calibrate":
-        assert ("--resume to go on" in said) == (tmp_path / "sbc.nc.fits").exists()
+        assert ("--resume to continue" in said) == (tmp_path / "sbc.nc.fits").exists()
     assert not left_in(tmp_path)
 
 

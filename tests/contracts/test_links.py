@@ -13,7 +13,9 @@ from numpyro import distributions as dist
 from numpyro.infer.util import log_density
 from synthetic_observations import make_observations
 
+from polar_bayes.design.fisher import information
 from polar_bayes.errors import FitError
+from polar_bayes.maps.residuals import standardize
 from polar_bayes.models.per_material import per_material
 from polar_bayes.observation import links
 from polar_bayes.observation.data import observe
@@ -88,6 +90,18 @@ def test_a_draw_has_one_finite_reading_per_view(name, link):
     assert draws.shape == (400, *SHAPE)
     assert np.all(np.isfinite(draws))
     assert np.all(are_possible)
+
+
+@EVERY_LINK
+def test_designs_and_maps_know_the_noise_of_its_readings(name, link):
+    def known(reading, *given):
+        distribution = link.distribution(name, *given)
+        return information(distribution)[1], standardize(distribution, reading).center
+
+    given = make_prediction(), make_data(), make_noise(link)
+    matrix, center = jax.eval_shape(known, make_prediction()[name], *given)
+    assert matrix.shape == (*SHAPE, 2, 2)
+    assert center.shape == SHAPE
 
 
 def density_of(name, link, dtype):

@@ -191,7 +191,7 @@ def test_tails_that_chains_may_have_missed_are_told() -> None:
         ("laplace", "only the heaviest is described here; use method='nuts'"),
         ("variational", "only the heaviest is described here; use method='nuts'"),
         ("nuts", "chains may not have visited them in proportion"),
-        ("importance", "the draws are of both"),
+        ("importance", "another explanation of the readings exists; add views"),
         ("mine", "another explanation of the readings exists; add views"),
     ],
 )
@@ -202,6 +202,11 @@ def test_another_mode_is_told_as_the_method_sees_it(method: str, words: str) -> 
     assert words in caution
     assert ("only the heaviest" in caution) == (method in ("laplace", "variational"))
     assert ("use method='nuts'" in caution) == (method in ("laplace", "variational"))
+    # Where weights reach the posterior, the draws have its share: a note is enough.
+    reached = {"pareto_k": 0.3} if method == "importance" else {}
+    judged = verdict(edit_provenance(tree, method=method, modes={"weights": [0.6, 0.4]}, **reached))
+    assert (not judged.cautions) == bool(reached)
+    assert any("the draws are of both" in note for note in judged.findings) == bool(reached)
 
 
 @pytest.mark.thorough
