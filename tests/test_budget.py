@@ -14,7 +14,7 @@ CODE = {
     "calibration": 1035,
     "capture": 814,
     "cli": 1256,
-    "design": 1088,
+    "design": 1087,
     "diagnostics": 1792,
     "importers": 2109,
     "inference": 2711,
@@ -27,14 +27,14 @@ CODE = {
     "scenes": 1760,
     "own files": 1574,
     "models": 320,
-    "tests": 24118,
+    "tests": 24119,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25530,
+    "code": 25529,
     "classes": 338,
-    "constants": 419,
+    "constants": 418,
     "Any": 177,
     "longest function": 80,
 }

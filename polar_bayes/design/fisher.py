@@ -20,7 +20,7 @@ times the paper's at $\mu = 1/2$ and without bound towards 0 and 1.
 
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -56,16 +56,18 @@ FisherInformation = tuple[tuple[Array, ...], Array]
 def information(distribution: dist.Distribution) -> FisherInformation:
     """Return the Fisher information of one reading about its distribution's parameters."""
     shape = distribution.batch_shape
-    distribution = unwrapped(distribution)
-    kinds = (kind for kind in _FORMULAS if isinstance(distribution, kind))
-    formula = _FORMULAS.get(next(kinds, object))
-    if formula is None:
-        what = f"the Fisher information of {type(distribution).__name__} is not known"
-        hint = f"use a link that gives one of {', '.join(f.__name__ for f in _FORMULAS)}"
-        raise FitError(what, where="identify", hint=hint)
-    parameters, matrix = formula(distribution)
+    parameters, matrix = _information(unwrapped(distribution))
     parameters = tuple(jnp.broadcast_to(x, shape) for x in parameters)
     return parameters, jnp.broadcast_to(matrix, (*shape, *matrix.shape[-2:]))
+
+
+@functools.singledispatch
+def _information(distribution: dist.Distribution) -> FisherInformation:
+    """The same by the kind of distribution, broadcast only as far as its parameters are."""
+    known = (kind.__name__ for kind in _information.registry if kind is not object)
+    what = f"the Fisher information of {type(distribution).__name__} is not known"
+    hint = f"use a link that gives one of {', '.join(known)}"
+    raise FitError(what, where="identify", hint=hint)
 
 
 def _symmetric(first: Array, across: Array, second: Array) -> Array:
@@ -74,13 +76,15 @@ def _symmetric(first: Array, across: Array, second: Array) -> Array:
     return jnp.stack(entries, axis=-1).reshape(*entries[0].shape, 2, 2)
 
 
-def _normal(normal: dist.Normal) -> FisherInformation:
+@_information.register
+def _(normal: dist.Normal) -> FisherInformation:
     precision = normal.scale**-2.0
     matrix = _symmetric(precision, jnp.zeros_like(precision), 2.0 * precision)
     return (normal.loc, normal.scale), matrix
 
 
-def _student(student: dist.StudentT) -> FisherInformation:
+@_information.register
+def _(student: dist.StudentT) -> FisherInformation:
     """Information on location and scale of Student's t: Lange et al. (1989), JASA 84, 881-896."""
     freedom, precision = student.df, student.scale**-2.0
     location = (freedom + 1.0) / (freedom + 3.0) * precision
@@ -89,7 +93,8 @@ def _student(student: dist.StudentT) -> FisherInformation:
     return (student.loc, student.scale), matrix
 
 
-def _sensor(sensor: SensorStudentT) -> FisherInformation:
+@_information.register
+def _(sensor: SensorStudentT) -> FisherInformation:
     """Information on location and scale: the mean outer product of scores at noise quantiles."""
     freedom = sensor.degrees_of_freedom
     nodes = scipy.stats.t(freedom).ppf((np.arange(NODES) + 0.5) / NODES)
@@ -112,7 +117,8 @@ def _sensor(sensor: SensorStudentT) -> FisherInformation:
     return (sensor.location, sensor.scale), matrix
 
 
-def _beta(beta: MeanConcentrationBeta) -> FisherInformation:
+@_information.register
+def _(beta: MeanConcentrationBeta) -> FisherInformation:
     r"""Information on mean and concentration.
 
     The information on the mean is $\kappa^2[\psi_1(\mu\kappa)+\psi_1((1-\mu)\kappa)]$.
@@ -135,6 +141,11 @@ def _beta(beta: MeanConcentrationBeta) -> FisherInformation:
     return (mean, concentration), matrix
 
 
+@_information.register
+def _(transformed: dist.TransformedDistribution) -> FisherInformation:
+    return information(transformed.base_dist)  # a fixed change of variables leaves it as it is
+
+
 def _censored_beta(mean: Array, concentration: Array, margin: float) -> Array:
     """Mean outer product of scores: by quadrature between the margins, and at both ends."""
     end = math.log(margin) - math.log1p(-margin)
@@ -151,16 +162,6 @@ def _censored_beta(mean: Array, concentration: Array, margin: float) -> Array:
         return volume * jnp.exp(log_density) * jnp.outer(score, score)
 
     return jnp.sum(jax.vmap(term)(reading, jnp.asarray(volume, mean.dtype)), axis=0)
-
-
-_FORMULAS: Mapping[type, Callable] = {
-    dist.Normal: _normal,
-    dist.StudentT: _student,
-    SensorStudentT: _sensor,
-    MeanConcentrationBeta: _beta,
-    # A fixed change of variables leaves the information as it is.
-    dist.TransformedDistribution: lambda transformed: information(transformed.base_dist),
-}
 
 
 # --- Fisher information of a capture about the unconstrained coordinates of a model ---------------

@@ -98,8 +98,9 @@ def test_designs_and_maps_know_the_noise_of_its_readings(name, link):
         distribution = link.distribution(name, *given)
         return information(distribution)[1], standardize(distribution, reading).center
 
-    given = make_prediction(), make_data(), make_noise(link)
-    matrix, center = jax.eval_shape(known, make_prediction()[name], *given)
+    prediction = make_prediction()
+    given = prediction, make_data(), make_noise(link)
+    matrix, center = jax.eval_shape(known, prediction[name], *given)
     assert matrix.shape == (*SHAPE, 2, 2)
     assert center.shape == SHAPE
 
