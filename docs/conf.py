@@ -84,6 +84,7 @@ intersphinx_mapping = (
 html_theme = "pydata_sphinx_theme"
 html_title = "polar_bayes"
 html_sidebars = {page: [] for page in ("index", "gallery")}
+html_favicon = "favicon.svg"
 html_static_path = ["style.css"]
 html_css_files = ["style.css"]
 html_context = {"default_mode": "auto"}
