@@ -62,6 +62,11 @@ class ConditionalReparam(AbstractDensity[ConditionalInputs]):
     sums: SumReparam | None
     by_name: Callable[[Array], dict[str, Array]]
 
+    @property
+    @override
+    def key(self) -> str:
+        return self.program.key and f"{self.program.key} conditional"
+
     @override
     def potential(self, x: Float[Array, " size"], given: ConditionalInputs) -> Float[Array, ""]:
         x, w, log_volume = self._moved(x, given)
@@ -80,10 +85,16 @@ class ConditionalReparam(AbstractDensity[ConditionalInputs]):
     def backward(self, z: np.ndarray, data: Observations) -> np.ndarray:
         """Return coordinates x of the program's vectors (row, size), standardized ones zero."""
         if self.sums is not None:
-            z = in_blocks(self.sums.backward_of_block, (z,), data)
+            z = in_blocks(self.sums_of_block, (z,), data)
         x = np.array(z)
         x[:, self.coefficients] = 0.0
         return x
+
+    @functools.cached_property
+    def sums_of_block(self) -> JitOnce:
+        """Coordinates along a sum of many vectors of the program, compiled."""
+        assert self.sums is not None
+        return self.once("sums", jax.vmap(self.sums.backward, in_axes=(0, None)))
 
     @functools.cached_property
     def forward_of_block(self) -> JitOnce:

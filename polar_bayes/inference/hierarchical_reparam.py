@@ -213,6 +213,11 @@ class HierarchicalReparam(AbstractDensity[ReparamInputs]):
     groups: Groups
 
     @property
+    @override
+    def key(self) -> str:
+        return self.program.key and f"{self.program.key} hierarchical"
+
+    @property
     def size(self) -> int:
         """Length of w: common coordinates first, then each group's."""
         return self.program.size
@@ -260,12 +265,12 @@ class HierarchicalReparam(AbstractDensity[ReparamInputs]):
     @functools.cached_property
     def forward_jit(self) -> JitOnce:
         """Compiled `forward`, without the volume."""
-        return JitOnce(lambda w, given: self.forward(w, given)[0])
+        return self.once("forward", lambda w, given: self.forward(w, given)[0])
 
     @functools.cached_property
     def inverse_jit(self) -> JitOnce:
         """Compiled `inverse`."""
-        return JitOnce(self.inverse)
+        return self.once("inverse", self.inverse)
 
     @functools.cached_property
     def forward_chains(self) -> JitOnce:
@@ -276,12 +281,12 @@ class HierarchicalReparam(AbstractDensity[ReparamInputs]):
                 lambda chain: jax.lax.map(lambda x: self.forward(x, given)[0], chain), w
             )
 
-        return JitOnce(chains)
+        return self.once("forward_chains", chains)
 
     @functools.cached_property
     def population_jit(self) -> JitOnce:
         """Compiled `population_derivatives`."""
-        return JitOnce(self.population_derivatives)
+        return self.once("population_derivatives", self.population_derivatives)
 
     def _group_prior(self, z: Float[Array, " size"], data: Observations) -> Float[Array, ""]:
         """Return minus the log prior density of the coordinates of all groups."""

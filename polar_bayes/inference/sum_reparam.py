@@ -27,7 +27,6 @@ from numpyro import distributions as dist
 from numpyro.distributions import transforms
 
 from polar_bayes.inference.program import Program
-from polar_bayes.numerics.compile import JitOnce
 from polar_bayes.observation.data import Observations
 from polar_bayes.priors import constraint_bounds, log_odds, log_slope, score_of_log_odds
 
@@ -66,11 +65,6 @@ class SumReparam:
             volume -= 0.0 if math.isinf(end) else part / end
             z = z.at[at].set(jnp.where(known, x[at], coordinate))
         return z, jnp.where(known, 0.0, volume)
-
-    @functools.cached_property
-    def backward_of_block(self) -> JitOnce:
-        """Compiled `backward` of many vectors."""
-        return JitOnce(jax.vmap(self.backward, in_axes=(0, None)))
 
     def backward(self, z: Float[Array, " size"], data: Observations) -> Float[Array, " size"]:
         """Return the coordinates of a vector of the program."""

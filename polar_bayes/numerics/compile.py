@@ -22,7 +22,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from jax.stages import Compiled, Lowered, Wrapped
 
 from polar_bayes.errors import FitError
-from polar_bayes.numerics.kept_programs import KeptProgram, cache_hits, kept_program
+from polar_bayes.numerics.kept_programs import KeptProgram, kept_program, with_new_name
 from polar_bayes.paths import compiled_folder, make_private
 from polar_bayes.progress import Progress
 
@@ -135,7 +135,7 @@ class JitOnce:
             key = self._key(arguments)
             if key not in self._compilations:
                 kept = kept_program(self.key, arguments)
-                function = self._function if kept is None else kept.named(self._function)
+                function = self._function if kept is None else with_new_name(self._function)
                 lower = functools.partial(compiled(function).lower, *arguments)
                 if kept is None or not kept.exists:
                     compile_now = lower().compile
@@ -184,10 +184,8 @@ class _Compilation:
     def _make(self, compile_now: Callable[[], Compiled]) -> Compiled:
         if self._kept is not None and (found := self._kept.load()) is not None:
             return found
-        hits = cache_hits()
         found = compile_now()
-        # XLA cannot write a program again that JAX's own cache has read; see `KeptProgram.named`.
-        if self._kept is not None and cache_hits() == hits:
+        if self._kept is not None:
             _COMPILER_THREAD.submit(self._kept.save, found)
         return found
 

@@ -13,7 +13,7 @@ import os
 import pickle
 import platform
 import shutil
-import threading
+import uuid
 import warnings
 from collections.abc import Callable, Iterable
 from importlib.metadata import version
@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from jax.experimental import serialize_executable
 from jax.stages import Compiled
 from jaxtyping import ArrayLike
@@ -33,21 +34,6 @@ LIBRARIES = ("jax", "jaxlib", "numpyro", "equinox", "tinygp", "numpy")
 
 MOST_ENVIRONMENTS = 3
 """Of sources, libraries and settings, whose programs stay on the disk."""
-
-_HITS = threading.local()
-
-
-def _count(event: str, **_: object) -> None:
-    if event == "/jax/compilation_cache/cache_hits":
-        _HITS.count = cache_hits() + 1
-
-
-jax.monitoring.register_event_listener(_count)
-
-
-def cache_hits() -> int:
-    """Programs that this thread has read from JAX's own cache."""
-    return getattr(_HITS, "count", 0)
 
 
 class KeptProgram:
@@ -67,23 +53,10 @@ class KeptProgram:
         """Whether there is something to load."""
         return self._path.is_file()
 
-    def named(self, function: Callable) -> Callable:
-        """The function by a name of this program alone.
-
-        JAX's own cache tells programs apart by name, too. So it has none of another version, which
-        could be run but not kept.
-        """
-
-        def run(*arguments: Any) -> Any:
-            return function(*arguments)
-
-        name, own = getattr(function, "__name__", "run"), (self._path.parent.name, self._path.name)
-        run.__name__ = "_".join([name, *(each[:8] for each in own)])
-        return run
-
     def load(self) -> Compiled | None:
         """The program; None where it is damaged, or gone by now."""
         try:
+            _find_lapack()
             program, result = pickle.loads(self._path.read_bytes())
             return serialize_executable.deserialize_and_load(program, self._arguments, result)
         except FileNotFoundError:
@@ -107,6 +80,28 @@ class KeptProgram:
             _make_room(self._path.parent)
             with atomic_write(self._path, replaces=lambda _: True) as unfinished:
                 unfinished.write_bytes(written)
+
+
+@functools.cache
+def _find_lapack() -> None:
+    """Have JAX look up LAPACK, as it does when it lowers a function that calls it.
+
+    A loaded program of a process that has lowered none would call an address of zero.
+    """
+    jax.jit(jax.lax.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), np.float32))
+
+
+def with_new_name(function: Callable) -> Callable:
+    """The function by a name that JAX's own cache does not know.
+
+    A program that XLA has read from that cache could be run, but not written again and so not kept.
+    """
+
+    def run(*arguments: Any) -> Any:
+        return function(*arguments)
+
+    run.__name__ = f"{getattr(function, '__name__', 'run')}_{uuid.uuid4().hex[:8]}"
+    return run
 
 
 def kept_program(key: str, arguments: tuple) -> KeptProgram | None:

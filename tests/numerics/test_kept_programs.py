@@ -33,9 +33,16 @@ print(len(compiled), repr(float(pb.summary(result).loc["refractive_index", "mean
 
 def run(cache: Path, leakage: float = 0.01, **variables: str) -> subprocess.CompletedProcess[str]:
     """A fit in a new process."""
+    return python(FIT, cache, str(leakage), **variables)
+
+
+def python(
+    code: str, cache: Path, *arguments: str, **variables: str
+) -> subprocess.CompletedProcess[str]:
+    """Code in a new process whose programs are kept in a folder of their own."""
     clean = {name: x for name, x in os.environ.items() if not name.startswith("JAX_")}
     own = {"XDG_CACHE_HOME": str(cache), "PYTHONPATH": str(Path(__file__).parents[1])}
-    words = [sys.executable, "-c", FIT, str(leakage)]
+    words = [sys.executable, "-c", code, *arguments]
     return subprocess.run(
         words, env=clean | own | variables, capture_output=True, text=True, check=True
     )
@@ -59,6 +66,15 @@ def first(cache: Path) -> tuple[int, float]:
 
 def programs(cache: Path) -> list[Path]:
     return [path for path in cache.rglob("compiled/programs/*/*") if path.is_file()]
+
+
+def wait_for_programs(cache: Path, count: int) -> list[Path]:
+    """Programs on the disk, which another thread writes."""
+    for _ in range(100):
+        if len(programs(cache)) < count:
+            time.sleep(0.05)
+    assert len(programs(cache)) == count
+    return programs(cache)
 
 
 @pytest.fixture
@@ -86,10 +102,39 @@ def test_a_program_that_another_version_left_in_the_cache_of_jax_is_kept(
     for count, program in enumerate((first, later), 1):
         np.testing.assert_allclose(program(x), np.cos(x) + 0.456, rtol=1e-14)
         jax.clear_caches()
-        for _ in range(100):  # it is written by another thread
-            if len(programs(tmp_path)) < count:
-                time.sleep(0.05)
-        assert len(programs(tmp_path)) == count
+        wait_for_programs(tmp_path, count)
+
+
+FACTORED = """
+import jax
+import jax.numpy as jnp
+from polar_bayes.numerics.compile import JitOnce
+
+def logarithm(x):
+    print("traced")
+    return jnp.log(jnp.linalg.cholesky(x)).diagonal().sum()
+
+print(float(JitOnce(logarithm, "factored")(4.0 * jnp.eye(3))))
+"""
+
+
+def test_a_process_that_traces_nothing_runs_a_program_that_calls_lapack(
+    tmp_path: Path,
+) -> None:
+    """JAX looks up LAPACK when it traces: the call of a loaded program once ended the process."""
+    traced, answer = python(FACTORED, tmp_path).stdout.split()
+    assert (traced, float(answer)) == ("traced", pytest.approx(3.0 * np.log(2.0), rel=1e-6))
+    assert python(FACTORED, tmp_path).stdout.split() == [answer]
+
+
+def test_a_program_that_is_gone_is_kept_again(tmp_path: Path, kept_here: None) -> None:
+    """Though the cache of JAX has it: what XLA reads from there it cannot write."""
+    x = jnp.arange(3.0)
+    for _ in range(2):
+        JitOnce(lambda x: jnp.tan(x) + 0.789, "gone")(x)
+        (kept,) = wait_for_programs(tmp_path, 1)
+        kept.unlink()
+        jax.clear_caches()
 
 
 def test_a_program_is_found_by_its_key_and_its_arguments(tmp_path: Path, kept_here: None) -> None:
