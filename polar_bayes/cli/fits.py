@@ -21,6 +21,7 @@ from polar_bayes.cli.options import (
     STORE,
     capture_argument,
     command,
+    is_given,
     json_option,
     known_option,
     link_option,
@@ -100,10 +101,10 @@ def _make_folder(folder: Path) -> None:
 @model_option
 @option(
     "--method", type=FIT_METHOD, default=FIT_DEFAULT,
-    help=f"{', '.join(FIT_METHOD.names)}; auto is the cheapest that is good enough.",
+    help=f"{', '.join(FIT_METHOD.names)}; by default auto, the cheapest that is good enough.",
 )  # fmt: skip
 @nuts_options
-@option("--seconds", type=float, help="Of --method auto, 60 by default; of --scene auto.")
+@option("--seconds", type=float, help="Time limit of --method auto; of --scene auto.")
 @option(
     "--scene", type=FIT_SCENE, metavar="NAME|FILE",
     help=f"{SCENE_HELP} auto: what `scenes` finds.",
@@ -113,7 +114,7 @@ def _make_folder(folder: Path) -> None:
 @known_option
 @view_limit_option
 @option("--choose-effects", "choose", is_flag=True, help="Fit what `effects` would keep.")
-@option("--tolerance", type=float, help="Of --choose-effects and --method auto; 0.1 sd.")
+@option("--tolerance", type=float, help="Of --choose-effects, 0.1 sd; of --method auto.")
 @seed_option
 @json_option
 def fit(
@@ -146,7 +147,8 @@ def fit(
             chosen: Any = pb.choose_effects(data, progress=progress, **options)
             say("\n".join(pb.verdict(chosen.ledger).sentences), err=True)
             settings["scene"] = _in_setup(chosen, settings["scene"])
-        settings |= {"tolerance": tolerance} if is_auto else {}
+        if is_auto and (is_given("method") or not choose):
+            settings["tolerance"] = tolerance
         result = pb.fit(data, progress=progress, keep=keep, **settings)
     pb.save(result, out)
     told = (

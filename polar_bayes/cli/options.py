@@ -14,7 +14,7 @@ from click.core import ParameterSource
 
 import polar_bayes as pb
 from polar_bayes.errors import CaptureError, FitError, OutputError, PolarBayesError, SceneError
-from polar_bayes.methods.registry import method_names
+from polar_bayes.methods.registry import FIT_DEFAULT, method_names
 from polar_bayes.paths import as_path, check_output, is_scene_file, refuse_inputs
 
 type Param = click.Parameter | None
@@ -230,12 +230,20 @@ def with_nuts_options(settings: dict[str, Any]) -> dict[str, Any]:
     given = {name: settings.pop(name) for name in NUTS_OPTIONS}
     given = {name: value for name, value in given.items() if value is not None}
     if given:
-        method = pb.methods.Nuts() if settings["method"] == "nuts" else settings["method"]
+        method = settings["method"]
+        if method == "nuts" or (method == FIT_DEFAULT and not is_given("method")):
+            method = pb.methods.Nuts()
         if not isinstance(method, pb.methods.Nuts):
             flags = ", ".join(f"--{name.replace('_', '-')}" for name in given)
             raise click.UsageError(f"{flags}: of --method nuts only")
         settings["method"] = dataclasses.replace(method, **given)
     return settings
+
+
+def is_given(name: str) -> bool:
+    """Return whether the user gave an option, or its default is used."""
+    source = click.get_current_context().get_parameter_source(name)
+    return source is not ParameterSource.DEFAULT
 
 
 seed_option = option("--seed", type=click.IntRange(0, 2**32 - 1), default=0)
@@ -261,13 +269,12 @@ def read_scene_options(settings: dict[str, Any]) -> dict[str, Any]:
     from polar_bayes.priors import parse_prior
     from polar_bayes.scenes.scene_file import load_scene, parse_link, parse_method
 
-    source = click.get_current_context().get_parameter_source
     found, stated = dict(settings), {}
     if isinstance(found.get("scene"), Path):
         stated = load_scene(found["scene"])
         found["scene"] = stated.pop("scene", None)
     for name in ("model", "method", "largest_view_zenith"):
-        if name in stated and name in found and source(name) is not ParameterSource.COMMANDLINE:
+        if name in stated and name in found and not is_given(name):
             found[name] = stated[name]
     if isinstance(found.get("method"), str):
         found["method"] = parse_method(found["method"], "--method")

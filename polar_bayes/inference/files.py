@@ -367,7 +367,7 @@ _FIT_PROVENANCE: Mapping[str, Spec] = {
     "modes?": {"weights?": [FINITE]},
     "pareto_k?": FINITE,
     "ess?": FINITE,
-    "auto?": {"tolerance": FINITE, "met": FLAG, "chosen": TEXT, "steps": [_STEP]},
+    "auto?": {"tolerance?": FINITE, "met": FLAG, "chosen": TEXT, "steps": [_STEP]},
 }
 
 STATISTICS = (
@@ -548,17 +548,21 @@ def sentences_of_auto(provenance: Provenance) -> list[str]:
     for step in summary["steps"]:
         name = f"{step['name']} ({step['seconds']:.1f} s)"
         if step["taken"]:
-            error = step.get("monte_carlo")
+            error, tolerance = step.get("monte_carlo"), summary.get("tolerance")
             within = "an unknown number of" if error is None else f"{error:.2g}"
+            limit = "" if tolerance is None else f"; the tolerance is {tolerance:g}"
             sentences.append(
                 f"{name} was selected: its means and standard deviations are expected within "
-                f"{within} posterior sd; the tolerance is {summary['tolerance']:g}."
+                f"{within} posterior sd{limit}."
             )
         else:
             sentences.append(f"{name} was rejected: {step['why']}.")
     if not summary["met"]:
+        met, hint = "passed its own diagnostics", "more seconds"
+        if summary.get("tolerance") is not None:
+            met, hint = "met the tolerance", "more seconds or a larger tolerance"
         sentences.append(
-            f"No method met the tolerance; the numbers are those of {summary['chosen']}, which "
-            "came nearest. Give more seconds or a larger tolerance, or do not rely on them."
+            f"No method {met}; the numbers are those of {summary['chosen']}, which came nearest. "
+            f"Give {hint}, or do not rely on them."
         )
     return sentences

@@ -63,11 +63,6 @@ class Problem:
         """Time that the search for modes took; 0 where no method has asked for it."""
         return self._searched[0][1] if self._searched else 0.0
 
-    @property
-    def is_one_spectrum_point(self) -> bool:
-        """True if the capture is of one material at one wavelength."""
-        return all(name == "view" or length == 1 for name, length in self.data.dims)
-
     def initialize(self, progress: Progress = no_progress) -> AbstractInit:
         """Search the posterior modes at the first call, and return the result.
 

@@ -3,23 +3,37 @@
 import dataclasses
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from types import MappingProxyType
-from typing import NamedTuple, override
+from typing import ClassVar, NamedTuple, override
 
 import numpy as np
 from jaxtyping import Array
 
 from polar_bayes.errors import FitError
+from polar_bayes.inference.batching import Status
 from polar_bayes.inference.problem import Problem
+from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
 from polar_bayes.inference.result import Provenance
-from polar_bayes.methods.importance import Importance
-from polar_bayes.methods.method import AbstractMethod, PosteriorDraws, flatten, make_method
+from polar_bayes.methods.importance import Importance, suits_profiles
+from polar_bayes.methods.method import (
+    AbstractBatchMethod,
+    AbstractMethod,
+    PosteriorDraws,
+    flatten,
+    make_method,
+    problem_of,
+)
 from polar_bayes.methods.nuts import Nuts
 from polar_bayes.methods.registry import method_names
 from polar_bayes.numerics.compile import OutOfTimeError, run_until
-from polar_bayes.numerics.mcse import LARGEST_R_HAT, draws_needed, largest_error
-from polar_bayes.numerics.psis import MAX_PARETO_K, max_effective_size
+from polar_bayes.numerics.mcse import (
+    LARGEST_R_HAT,
+    SMALLEST_ESS,
+    draws_needed,
+    largest_error,
+)
+from polar_bayes.numerics.psis import FINITE_VARIANCE, MAX_PARETO_K, max_effective_size
 from polar_bayes.progress import Progress
 
 MARGIN, MOST_TIMES = 1.5, 16.0
@@ -38,31 +52,35 @@ def expected_error(draws: PosteriorDraws, problem: Problem) -> float:
 class Auto(AbstractMethod):
     """The cheapest method that passes its own diagnostics.
 
-    Methods are tried from cheap to exact: importance (of one material in one color), NUTS. One is
-    taken when Pareto k is at most 0.7, R-hat at most 1.01, nothing diverged, no mode was left
-    out, and the Monte Carlo error of every mean and standard deviation is within the tolerance (but
-    in 1% of the fits). Where only that is missing, the same method is tried once more with more
-    draws.
+    Methods are tried from cheap to exact: importance (of at most 20 coordinates), NUTS. One is
+    taken when R-hat is at most 1.01, nothing diverged, no mode was left out, and there are enough
+    draws. Without a tolerance these are 400 effective ones, and weights that replace chains have a
+    finite variance (Pareto k at most 0.5). With a tolerance Pareto k is at most 0.7, and the Monte
+    Carlo error of every mean and standard deviation is within the tolerance (but in 1% of the
+    fits); where only that is missing, the same method is tried once more with more draws.
 
     Args:
         tolerance: Largest error of a posterior mean or standard deviation, in posterior standard
-            deviations, above 0 and at most 1.
-        seconds: Of the whole fit, counted from the call of `fit`, > 0. What is not done by then is
-            abandoned, comparison fits included, which are made by the method that was taken; only
-            the first method always ends.
+            deviations, above 0 and at most 1; None for the number of draws that each method has by
+            default.
+        seconds: Of the whole fit, counted from the call of `fit`, > 0; None for no limit. What is
+            not done by then is abandoned, comparison fits included, which are made by the method
+            that was taken; only the first method always ends.
 
     Raises:
         FitError: A setting is out of range.
     """
 
-    tolerance: float = 0.1
-    seconds: float = 60.0
+    tolerance: float | None = None
+    seconds: float | None = None
+
+    group_size: ClassVar[int] = AbstractBatchMethod.group_size
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.tolerance <= 1.0:
+        if self.tolerance is not None and not 0.0 < self.tolerance <= 1.0:
             hint = "give posterior standard deviations above 0, at most 1, such as 0.1"
             self.refuse(f"tolerance is {self.tolerance}", hint)
-        if not self.seconds > 0.0:
+        if self.seconds is not None and not self.seconds > 0.0:
             self.refuse(f"seconds is {self.seconds}", "give a time above 0, such as 60")
 
     def candidates(self, problem: Problem) -> dict[str, AbstractMethod]:
@@ -78,9 +96,12 @@ class Auto(AbstractMethod):
         Returns:
             Methods by name.
         """
+        weighs = suits_profiles(problem.program)
+        if self.tolerance is None:
+            return {"importance": Importance(), "nuts": Nuts()} if weighs else {"nuts": Nuts()}
         needed = draws_needed(self.tolerance, int(problem.describe()["size"].sum()))
         chains = Nuts(ess=max(450.0, float(needed)), most_draws=max(4000, 4 * needed))
-        if not problem.is_one_spectrum_point:
+        if not weighs:
             return {"nuts": chains}
         # Long tails need more weighted draws than normal posteriors; beyond so many chains are the
         # better way.
@@ -124,7 +145,7 @@ class Auto(AbstractMethod):
                 best = attempt, draws
             if attempt.taken:
                 break
-            if name not in tried and np.isfinite(attempt.error):
+            if self.tolerance and name not in tried and np.isfinite(attempt.error):
                 tried.add(name)
                 times = MARGIN * (attempt.error / self.tolerance) ** 2
                 # Powers of two: of a layout, few numbers of draws are ever compiled.
@@ -133,19 +154,49 @@ class Auto(AbstractMethod):
         return self._report(best, attempts)
 
     @override
+    def prepare(self, problem: Problem) -> None:
+        next(iter(self.candidates(problem).values())).prepare(problem)
+
+    @override
     def deadline(self, problem: Problem) -> float:
-        return problem.start_time + self.seconds
+        return problem.start_time + (np.inf if self.seconds is None else self.seconds)
 
     @override
     def for_comparison(self, problem: Problem, draws: PosteriorDraws) -> tuple[AbstractMethod, ...]:
-        chosen = self.candidates(problem)[draws.metadata["auto"]["chosen"]]
-        return chosen.for_comparison(problem, draws)
+        methods = self.candidates(problem)
+        begin = list(methods).index(draws.metadata["auto"]["chosen"])
+        chosen, *others = (
+            each.for_comparison(problem, draws) for each in list(methods.values())[begin:]
+        )
+        return (*chosen, *(each[-1] for each in others))
+
+    @override
+    def run_batch(self, batch: ProblemBatch) -> Iterator[BatchDraws]:
+        """Fit all captures by the cheapest method, and those that it does not fit by the next."""
+        if self.tolerance is not None or self.seconds is not None:  # which differ by capture
+            yield from super().run_batch(batch)
+            return
+        for method in self.candidates(problem_of(batch, 0)[0]).values():
+            taken: list[int] = []
+            for found in method.run_batch(batch):
+                good = np.asarray(found.status) == Status.GOOD
+                good &= ~(np.asarray(found.pareto_k) > FINITE_VARIANCE)
+                good &= np.asarray(found.ess) >= SMALLEST_ESS
+                taken.extend(found.at[np.broadcast_to(good, found.at.shape)])
+                yield found
+            batch = batch.subset(np.flatnonzero(~np.isin(batch.at, taken)))
+            if not len(batch):
+                return
 
     def _judge(self, name: str, draws: PosteriorDraws, problem: Problem, begin: float) -> "Attempt":
         error = expected_error(draws, problem)
         doubts = bias_doubts(draws, problem)
+        if self.tolerance is None and draws.pareto_k > FINITE_VARIANCE and not doubts:
+            doubts.append(f"its Pareto k is {draws.pareto_k:.2f}")
         biased = bool(doubts)
-        if not error <= self.tolerance:
+        if self.tolerance is None and not draws.ess >= SMALLEST_ESS:
+            doubts.append(f"its effective sample size is {draws.ess:.0f}")
+        if self.tolerance is not None and not error <= self.tolerance:
             doubts.append(f"its Monte Carlo error may be {error:.2g} posterior sd")
         return Attempt(
             name,
@@ -171,11 +222,11 @@ class Auto(AbstractMethod):
             )
         attempt, draws = best
         problems = list(draws.problems)
-        if not attempt.taken:
+        if not attempt.taken and self.tolerance is not None:
+            within = "" if self.seconds is None else f" within {self.seconds:g} s"
             problems.append(
-                f"no method met the tolerance of {self.tolerance:g} posterior sd within "
-                f"{self.seconds:g} s: {attempt.name} came nearest, and "
-                f"{attempt.why or 'was not judged'}"
+                f"no method met the tolerance of {self.tolerance:g} posterior sd{within}: "
+                f"{attempt.name} came nearest, and {attempt.why or 'was not judged'}"
             )
         summary = {
             "tolerance": self.tolerance,

@@ -33,7 +33,7 @@ from polar_bayes.inference.compiled_model import (
 )
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.problem_batch import SMALL_BATCH, BatchDraws, ProblemBatch
-from polar_bayes.inference.program import THREADS, Values, split_key
+from polar_bayes.inference.program import THREADS, Program, Values, split_key
 from polar_bayes.inference.result import CENTRAL_95, Provenance
 from polar_bayes.methods.method import AbstractBatchMethod, AbstractMethod, PosteriorDraws
 from polar_bayes.methods.profile_mixture import (
@@ -177,9 +177,9 @@ ONE_ROUND = Importance(rounds=1)
 """Settings of draws that check other draws, or serve a comparison."""
 
 
-def suits_profiles(problem: Problem) -> bool:
-    """Return whether draws along all profiles are few enough to serve as a check."""
-    return problem.program.size <= MOST_COORDINATES
+def suits_profiles(program: Program) -> bool:
+    """Return whether draws along the profiles of all coordinates are few enough."""
+    return program.size <= MOST_COORDINATES
 
 
 def tail_shares(problem: Problem, parameters: Values, key: Array) -> Provenance:
@@ -188,7 +188,7 @@ def tail_shares(problem: Problem, parameters: Values, key: Array) -> Provenance:
     Chains that never entered an arm of the posterior agree with each other; draws along its
     profiles reach the arm. Empty where such draws do not suit the problem.
     """
-    if not suits_profiles(problem):
+    if not suits_profiles(problem.program):
         return {}
     try:
         found = ONE_ROUND.run(problem, key, no_progress)

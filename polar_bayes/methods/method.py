@@ -274,10 +274,7 @@ class AbstractMethod(AbstractBatchMethod):
 
         def run(row: int) -> BatchDraws | None:
             with jax.enable_x64(double):  # a thread does not inherit it
-                key = jax.random.wrap_key_data(jnp.asarray(batch.keys[row]))
-                key_search, key_draws = jax.random.split(key)
-                data = batch.engine.free(batch.pixels.pixel(row))
-                problem = Problem(batch.engine, data, key_search)
+                problem, key_draws = problem_of(batch, row)
                 try:
                     draws = self.run(problem, key_draws, no_progress)
                 except (FitError, np.linalg.LinAlgError):  # no mode, or no width around it
@@ -299,6 +296,14 @@ class AbstractMethod(AbstractBatchMethod):
             )
 
         yield from (found for found in _THREADS.map(run, range(len(batch))) if found is not None)
+
+
+def problem_of(batch: ProblemBatch, row: int) -> tuple[Problem, Array]:
+    """Return one capture of a batch as a problem, with the key of its draws."""
+    key = jax.random.wrap_key_data(jnp.asarray(batch.keys[row]))
+    key_search, key_draws = jax.random.split(key)
+    data = batch.engine.free(batch.pixels.pixel(row))
+    return Problem(batch.engine, data, key_search), key_draws
 
 
 def assess_draws(draws: PosteriorDraws, parameters: Values) -> tuple[Status, float, MethodUsed]:

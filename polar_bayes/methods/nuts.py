@@ -128,7 +128,7 @@ class Nuts(AbstractMethod):
         most = max(self.most_draws // 4, least)
         half = 0.5 * self.ess
         chains = dataclasses.replace(self, draws=least, most_draws=most, ess=half)
-        return (ONE_ROUND, chains) if suits_profiles(problem) else (chains,)
+        return (ONE_ROUND, chains) if suits_profiles(problem.program) else (chains,)
 
     @override
     def cross_check(self, problem: Problem, parameters: Values, key: Array) -> Provenance:

@@ -47,7 +47,7 @@ METHODS: Mapping[str, MethodEntry] = MappingProxyType(
     }
 )
 
-FIT_DEFAULT, MAP_DEFAULT = "nuts", "corrected-laplace"
+FIT_DEFAULT, MAP_DEFAULT = "auto", "corrected-laplace"
 
 
 def method_names(*, one: bool = False, many: bool = False) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ import polar_bayes.scenes  # its names load the comparison, and with it diagnost
 from polar_bayes.capture.schema import validate
 from polar_bayes.inference.request import resolve
 from polar_bayes.methods.method import AbstractMethod
+from polar_bayes.methods.registry import FIT_DEFAULT
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress, no_progress, with_progress
@@ -22,7 +23,7 @@ def fit(
     capture: xr.Dataset,
     *,
     model: str | Callable = "per_material",
-    method: str | AbstractMethod = "nuts",
+    method: str | AbstractMethod = FIT_DEFAULT,
     tolerance: float | None = None,
     seconds: float | None = None,
     scene: str | Scene | None = None,
@@ -41,14 +42,14 @@ def fit(
         capture: A Dataset of the capture schema; validated here.
         model: A name in `polar_bayes.inference.request.MODELS` or a callable
             `model(data, scene, priors, links)`.
-        method: "nuts", "laplace", "point", "importance" (weighted draws of mixtures at all modes),
-            "auto" (the cheapest of these that is good enough), or settings such as
-            `Nuts(draws=2000)`. A name is the same algorithm in maps and calibrations.
+        method: "auto" (weighted draws where they reach all of the posterior, else NUTS), "nuts",
+            "laplace", "point", "importance" (weighted draws of mixtures at all modes), or settings
+            such as `Nuts(draws=2000)`. A name is the same algorithm in maps and calibrations.
         tolerance: Of "auto": largest error of a posterior mean or standard deviation, in posterior
-            standard deviations, above 0 and at most 1; by default 0.1.
-        seconds: Of "auto": wall time of the whole fit, by default 60. Only the first method always
-            ends; what is not done by then is abandoned, and the best answer so far is returned.
-            Also of scene="auto", with any method: of the comparison of scenes.
+            standard deviations, above 0 and at most 1; by default, 400 effective draws or more.
+        seconds: Of "auto": wall time of the whole fit, by default without limit. Only the first
+            method always ends; what is not done by then is abandoned, and the best answer so far is
+            returned. Also of scene="auto", with any method: of the comparison of scenes.
         scene: A name in `SETUPS` or a `Scene`; by default the set-up that the capture names in
             its attribute `setup`, else "polarimeter". "auto" compares scenes, as
             `polar_bayes.compare_scenes` does, and stacks the posteriors of those that remain.

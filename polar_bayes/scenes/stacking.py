@@ -17,10 +17,10 @@ from polar_bayes.diagnostics.parameters import SAMPLE_DIMS
 from polar_bayes.errors import FitError
 from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.result import PROVENANCE, provenance_of
+from polar_bayes.methods.auto import Auto
 from polar_bayes.methods.importance import Importance
 from polar_bayes.methods.least_squares import Point
 from polar_bayes.methods.method import AbstractMethod
-from polar_bayes.methods.nuts import Nuts
 from polar_bayes.numerics.psis import FINITE_VARIANCE
 from polar_bayes.progress import Progress
 from polar_bayes.scenes.comparison import FitArguments, compare_candidates
@@ -60,7 +60,11 @@ def fit_best_scenes(
             if as_compared
             and (
                 isinstance(method, Importance)  # the comparison has more rounds of the same
-                or (method == Nuts() and _serves_as_chains(comparison.fits[name]))
+                or (
+                    isinstance(method, Auto)
+                    and method.tolerance is None
+                    and _serves_as_chains(comparison.fits[name])
+                )
             )
             else fit_request(
                 comparison.requests[name],

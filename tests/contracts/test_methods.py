@@ -30,7 +30,7 @@ def fit(method: object) -> xr.DataTree:
 
 def names(**able: bool) -> list:
     """Methods that give draws; chains of every pixel take their time."""
-    slow = ["nuts", "auto"] if "many" in able else []
+    slow = ["nuts"] if "many" in able else []
     return [
         pytest.param(name, marks=[pytest.mark.thorough] if name in slow else [])
         for name in method_names(**able)

@@ -13,8 +13,8 @@ import jax
 import numpy as np
 import pytest
 from cases import each
-from plates import plate_capture
-from toy_models import capture, funnel, line, of_line, problem
+from plates import at_mirror, plate_capture
+from toy_models import VIEWS, capture, funnel, line, of_line, problem
 
 import polar_bayes as pb
 from polar_bayes.inference.problem import Problem
@@ -113,9 +113,10 @@ class Given(pb.methods.Auto):
         return dict(self.given)
 
 
-def fitted(*rungs, **settings):
+def fitted(*rungs, tolerance=0.1, **settings):
     given = tuple((f"rung {number}", rung) for number, rung in enumerate(rungs))
-    result = pb.fit(capture(), model=line, links=LINKS, method=Given(given=given, **settings))
+    method = Given(given=given, tolerance=tolerance, **settings)
+    result = pb.fit(capture(), model=line, links=LINKS, method=method)
     return result, json.loads(result.attrs["polar_bayes"])
 
 
@@ -175,6 +176,32 @@ def test_where_nothing_is_good_enough_the_nearest_is_returned_and_flagged():
     assert "No method met the tolerance" in pb.inference.auto_sentences(result)[-1]
 
 
+@each(
+    ("rung", "why"),
+    [
+        (Made(pareto_k=0.6), "its Pareto k is 0.60"),
+        (Made(draws=300), "its effective sample size is 300"),
+    ],
+)
+def test_without_a_tolerance_each_method_draws_once_as_much_as_it_has_to(rung, why):
+    result, said = fitted(rung, Made(draws=500), Made(fails="must not be tried"), tolerance=None)
+    assert [step["why"] for step in said["auto"]["steps"]] == [why, ""]
+    assert pb.verdict(result).converged
+    result, said = fitted(rung, tolerance=None)
+    assert not said["auto"]["met"]
+    assert "passed its own diagnostics" in pb.inference.auto_sentences(result)[-1]
+
+
+def test_of_many_captures_those_that_the_cheapest_does_not_fit_are_left_to_the_next():
+    q = np.stack([capture(seed)["q"] for seed in range(3)])
+    image = at_mirror(VIEWS, q=(("y", "x", "view"), q[None])).assign_attrs(name="lines")
+    first, second = Made(draws=600, pareto_k=0.6), Made(draws=500)
+    for rungs, draws in (((first, second), 500), ((second, first), 500), ((first,), 600)):
+        method = Given(given=tuple((str(rung), rung) for rung in rungs))
+        maps = pb.fit_pixels(image, model=line, links=LINKS, method=method)
+        assert (maps["ess"] == draws).all()
+
+
 @pytest.mark.thorough
 def test_of_two_in_doubt_the_dearer_one_is_returned():
     _, said = fitted(Made(pareto_k=0.9), Made(pareto_k=np.nan, r_hat=1.2))
@@ -202,7 +229,7 @@ def test_what_is_stuck_is_abandoned_and_the_best_answer_so_far_is_returned():
     here = problem(line)
     Given(given=rungs[:1]).run(here, KEY, no_progress)  # what judges draws is compiled
     begin = time.perf_counter()
-    found = Given(given=rungs, seconds=1.0).run(
+    found = Given(given=rungs, tolerance=0.1, seconds=1.0).run(
         dataclasses.replace(here, start_time=begin), KEY, no_progress
     )
     assert time.perf_counter() - begin < 0.5 * Stuck.seconds
