@@ -62,7 +62,7 @@ def residuals_of(fit: FitView) -> Residuals | None:
     constants = result.children.get("constant_data", xr.DataTree()).data_vars
     if not all(name in constants for name in ANGLES):
         return None
-    predictions = [x for v in variables for x in (v.predicted, v.noise_free)]
+    predictions = [np.asarray(x, float) for v in variables for x in (v.predicted, v.noise_free)]
     if not all((np.abs(x) < 1e100).all() for x in predictions) or not variables:  # squares, too
         return None
     noise_free = np.concatenate([v.noise_free for v in variables], axis=1)

@@ -364,6 +364,7 @@ def test_comparisons_have_the_labels_of_the_fit():
         valid=np.ones((3, 2), bool),
         saturated=np.zeros((3, 2), bool),
         intensity_unit=1.0,
+        measured=slice(None),
     )
     parameters = {"absorption": np.zeros((1, 5, 2))}
     names = ("predictive", "center", "log_likelihood", "log_prior")
