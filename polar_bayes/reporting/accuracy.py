@@ -150,14 +150,12 @@ def _name_methods(axes: Axes, known: pd.DataFrame, time: str, colors: dict[str, 
 def accuracy_page(result: xr.DataTree) -> page.Page:
     """Return the page of an accuracy study."""
     study, provenance = accuracy_view(result), provenance_of(result)
-    facts = page.make_facts(
-        {str(key).replace("_", " "): value for key, value in provenance.items()}
-    )
+    facts = {str(key).replace("_", " "): value for key, value in provenance.items()}
     sections = [
         page.Section("front", "Error against time", [accuracy_picture(study)]),
         page.Section("methods", "Methods and settings", [study_table(study)]),
         page.Section("parameters", "Errors of every parameter", [error_table(study)]),
-        page.Section("provenance", "Provenance", facts),
+        page.Section("provenance", "Provenance", [page.facts(facts)]),
     ]
     return page.Page(
         kind="Accuracy against time",
@@ -178,7 +176,7 @@ def accuracy_card(result: xr.DataTree) -> page.Card:
     return sentences, study_table(study), not study.doubts
 
 
-def accuracy_picture(study: AccuracyView) -> page.Picture:
+def accuracy_picture(study: AccuracyView) -> str:
     """Plot error against time."""
     return page.picture(plot_accuracy(study), "accuracy.figure_front")
 

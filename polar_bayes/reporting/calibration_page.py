@@ -77,7 +77,7 @@ def calibration_page(
     estimates = _paged(shown, figures.estimates, "estimates", max_intervals=MAX_INTERVALS)
     simulations = next(iter(ranks.values())).pit.size
     elsewhere = " What it is compared with stays where it is." if others else ""
-    fits = [*_fit_tables(tree, ranks), *page.make_facts(_fit_facts(tree))]
+    fits = [*_fit_tables(tree, ranks), page.facts(_fit_facts(tree))]
     sections = [
         page.Section("parameters", "Parameters", [introduction, rank_table(table, ranks)]),
         page.Section("comparison", "Comparison with other methods", comparison),
@@ -136,7 +136,7 @@ def _others(given: Mapping[str, xr.DataTree], method: str) -> dict[str, Calibrat
 
 def _paged(
     ranks: Sequence[Ranks], draw: Callable[[Sequence[Ranks]], Figure], name: str, **values: Any
-) -> Iterator[page.Picture]:
+) -> Iterator[str]:
     """Yield figures of a few panels; the first caption explains them all."""
     for at in range(0, len(ranks), MAX_PANELS):
         some = ranks[at : at + MAX_PANELS]
@@ -296,7 +296,7 @@ def _fit_facts(calibration: xr.DataTree) -> dict[str, str]:
     return facts
 
 
-def _provenance_facts(provenance: Provenance) -> Iterator[page.Block]:
+def _provenance_facts(provenance: Provenance) -> Iterator[str]:
     """Return the provenance of the calibration in titled groups of names and values."""
     titles = {
         "truth": "What captures were simulated by, where it differs from what is fitted",
@@ -319,7 +319,7 @@ def _provenance_facts(provenance: Provenance) -> Iterator[page.Block]:
     priors = groups.get(titles["priors"], {})
     groups |= {titles["priors"]: {n: short_numbers(str(x)) for n, x in priors.items()}}
     for title, values in {"Calibration": own, **groups}.items():
-        yield from page.make_facts(values, title)
+        yield page.facts(values, title)
 
 
 REPORT = page.Report(

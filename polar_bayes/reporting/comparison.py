@@ -70,15 +70,15 @@ def comparison_page(fits: Mapping[str, xr.DataTree]) -> page.Page:
     provenances = {name: provenance_of(fit) for name, fit in named.items()}
     verdicts = comparison.verdicts
     failed = {name: verdict for name, verdict in verdicts.items() if not verdict.passed}
-    sensitivity = sensitivity_table(comparison)
     left_out = [f"{name}: {why}." if name else why for name, why in comparison.left_out.items()]
-    predictions: list[page.Block] = [] if comparison.loo.empty else [loo_table(comparison)]
+    loo = None if comparison.loo.empty else loo_table(comparison)
+    predictions = [loo, page.block("bullets", sentences=left_out)]
     more = comparison.parameters.index.get_level_values("parameter").nunique() - style.MAX_PANELS
     note = f" {more} more parameters are in the table only." if more > 0 else ""
     figure = page.picture(plot_comparison(comparison), "comparison.figure_parameters", more=note)
-    prior = [sensitivity] if sensitivity else []
+    prior = [sensitivity_table(comparison)]
     sections = [
-        page.Section("predictions", "Predictions", [*predictions, *page.make_bullets(left_out)]),
+        page.Section("predictions", "Predictions", predictions),
         page.Section("parameters", "Parameters", [figure, parameter_table(comparison)]),
         page.Section("prior", "Prior and data", prior, "Prior and data"),
         page.Section("settings", "What differs", [settings_table(provenances)]),

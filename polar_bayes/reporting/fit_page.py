@@ -102,7 +102,7 @@ def fit_page(result: xr.DataTree | FitView) -> page.Page:
         sentences = [*text.determined(fit), *text.between_members(fit)]
     approximation = "Convergence" if fit.method == "nuts" else "Approximation"
     code = str(fit.provenance.get("model_source") or "")
-    source = [page.Details("Source of the model", code=code)] if code else []
+    source = page.block("details", "Source of the model", code=code) if code else ""
     sections = [
         Section("parameters", "Parameters", [parameter_table(fit)]),
         Section("scenes", "Which scene", _scenes(fit.result)),
@@ -123,7 +123,7 @@ def fit_page(result: xr.DataTree | FitView) -> page.Page:
         Section("checks", "Predictive checks", _checks(fit)),
         Section("effects", "Effects", _effects(fit.result)),
         Section("accuracy", "Accuracy against time", _accuracy(fit.result)),
-        Section("provenance", "Provenance", [*provenance_facts(fit.provenance), *source]),
+        Section("provenance", "Provenance", [*provenance_facts(fit.provenance), source]),
     ]
     method = METHODS[fit.method].label if fit.method in METHODS else one_line(fit.method)
     swapped = text.swapped_sentence(fit.provenance)
@@ -137,7 +137,7 @@ def fit_page(result: xr.DataTree | FitView) -> page.Page:
         answers=tuple(zip(text.QUESTIONS, answers, strict=False)),
         sentences=[*sentences, *text.notes(judged)],
         cautions=judged.cautions,
-        beside=_glance(fit) if plots_curves.variables(fit) else None,
+        beside=_glance(fit) if plots_curves.variables(fit) else "",
         sections=sections,
         footer="Computed from result.nc, which lies in the same folder and holds every draw.",
     )
@@ -221,7 +221,7 @@ def sensitivity_table(fit: FitView) -> Table:
     return fit_table(fit, "fit.sensitivity", cells, sensitivity(fit), **options)
 
 
-def _pairs(fit: FitView) -> Iterator[page.Picture]:
+def _pairs(fit: FitView) -> Iterator[str]:
     if has_draws(fit) and len(plots_fit.drawable(fit, material=True)) > 1:
         yield page.picture(plots_fit.plot_pairs(fit), "fit.figure_pairs")
 
@@ -314,7 +314,7 @@ def _population(fit: FitView) -> list[page.Block]:
         population_table(fit),
         *pictures,
         *([f"{more} more populations are in the table only."] if more > 0 else []),
-        page.Details("Every member in numbers", (member_table(fit),)),
+        page.block("details", "Every member in numbers", items=[member_table(fit)]),
     ]
 
 
@@ -386,11 +386,12 @@ def _without(fit: FitView) -> Iterator[page.Block]:
         compared = compare_without(fit, key)
         if compared.empty:
             continue
-        yield page.Heading(f"Without {part}")
+        yield page.block("heading", f"Without {part}")
         yield discrepancy_table(fit, compared, part, f"without-{at}")
         yield from text.overconfidence(fit, compared, part)
     for key, reason in (fit.provenance.get("comparisons_failed") or {}).items():
-        yield page.Heading(f"Without {WITHOUT.get(key.removeprefix('without_'), one_line(key))}")
+        part = WITHOUT.get(key.removeprefix("without_"), one_line(key))
+        yield page.block("heading", f"Without {part}")
         yield f"This comparison failed, so nothing is said of it: {one_line(reason)}."
 
 
@@ -442,14 +443,14 @@ def budget_table(fit: FitView) -> Table:
 # --- Readings and checks --------------------------------------------------------------------------
 
 
-def _glance(fit: FitView) -> page.Picture:
+def _glance(fit: FitView) -> str:
     """Return small figures of readings and fit, which are shown next to the verdict."""
     quantity = QUANTITIES[plots_curves.variables(fit)[0]]
     figure = plots_curves.readings_at_a_glance(fit)
     return page.picture(figure, "fit.figure_glance", quantity=quantity)
 
 
-def _readings(fit: FitView) -> Iterator[page.Picture]:
+def _readings(fit: FitView) -> Iterator[str]:
     key = "fit.figure_readings" if has_draws(fit) else "fit.figure_point_readings"
     for name in plots_curves.variables(fit):
         quantity = QUANTITIES[name]
@@ -524,8 +525,8 @@ def _convergence(fit: FitView) -> Iterator[page.Block]:
     if fit.method == "nuts":
         yield convergence_table(fit)
     if "auto" in fit.provenance:
-        yield from page.make_bullets(sentences_of_auto(fit.provenance))
-    yield from page.make_facts(_sampler_facts(fit))
+        yield page.block("bullets", sentences=sentences_of_auto(fit.provenance))
+    yield page.facts(_sampler_facts(fit))
     if fit.method == "nuts" and has_draws(fit):
         yield page.picture(plots_fit.plot_ranks(fit), "fit.figure_ranks")
 
@@ -601,7 +602,7 @@ def _accuracy(result: xr.DataTree) -> Iterator[page.Block]:
         yield study_table(study)
 
 
-def provenance_facts(provenance: Provenance) -> list[page.Block]:
+def provenance_facts(provenance: Provenance) -> list[str]:
     """Return the provenance in titled groups; what the user replaced is marked."""
     keys = ["method", "settings", "model", "scene", "scene_parts", "seed", "precision"]
     keys += ["chain_method", "step_size_halvings", "largest_view_zenith"]
@@ -622,14 +623,13 @@ def provenance_facts(provenance: Provenance) -> list[page.Block]:
         "links": set(groups["links"]) if "links" in swapped else set(),
     }
     return [
-        block
-        for name, values in {"fit": fit, **groups}.items()
-        for block in page.make_facts(
+        page.facts(
             values,
             PROVENANCE_GROUPS.get(name, "Fit"),
             marked=marked.get(name, ()),
             mark="replaced",
         )
+        for name, values in {"fit": fit, **groups}.items()
     ]
 
 

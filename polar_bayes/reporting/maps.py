@@ -285,7 +285,7 @@ def map_page(
 def _explorer() -> page.Block:
     """Where the map is that one can point at, or why there is none."""
     if page.has_explorer():
-        return page.Link("The same map to point at, pixel by pixel.", page.EXPLORER)
+        return page.block("link", "The same map to point at, pixel by pixel.", page.EXPLORER)
     return text.no_explorer()
 
 
@@ -320,7 +320,7 @@ def parameter_titles(scalars: Sequence[Scalar]) -> dict[Scalar, str]:
     return titles
 
 
-def _pictures(maps: xr.Dataset, scalars: Sequence[Scalar]) -> Iterator[page.Picture]:
+def _pictures(maps: xr.Dataset, scalars: Sequence[Scalar]) -> Iterator[str]:
     """Yield figures of means, widths and diagnostics, a few parameters each."""
     dims = {scalar.name: set(scalar.index) for scalar in scalars}
     names = [name for name in dims if dims[name] <= {"wavelength"}]
