@@ -99,6 +99,11 @@ class Table:
         """Names of the columns; column_1, column_2, ... without a header line."""
         return tuple(self.columns)
 
+    @property
+    def places(self) -> list[str]:
+        """Each line, as errors name it."""
+        return [f"{self.source}: line {line}" for line in self.lines]
+
 
 def read_table(
     path: str | os.PathLike[str],

@@ -504,14 +504,13 @@ def _rows_of(name: str, table: Table, angle: str, reading: str) -> Rows:
     if not np.isfinite(table.columns[reading]).any():
         where = f"{table.source}: column {reading}"
         raise CaptureError("no line has a reading", where=where, hint="name another column")
-    places = [f"{table.source}: line {line}" for line in table.lines]
     return Rows(
         name,
         table.columns[angle],
         table.columns[reading],
         table.steps[reading],
         table.errors[reading],
-        places,
+        table.places,
         [*table.notes],
     )
 

@@ -35,7 +35,7 @@ from polar_bayes.numerics.psis import MAX_PARETO_K
 from polar_bayes.priors import short_numbers
 from polar_bayes.reporting import page, text
 from polar_bayes.reporting import plots_calibration as figures
-from polar_bayes.reporting.maps import STATUSES, count_table, flag_meanings
+from polar_bayes.reporting.maps import STATUS_MEANINGS, count_table, flag_meanings
 from polar_bayes.reporting.plots_calibration import MAX_INTERVALS, Ranks
 from polar_bayes.reporting.style import MAX_PANELS, QUANTITIES
 from polar_bayes.reporting.text import DASH, column, number
@@ -260,7 +260,7 @@ def _fit_tables(calibration: xr.DataTree, ranks: Mapping[str, Ranks]) -> Iterato
     fits = calibration["fits"].to_dataset()
     answered = np.all([np.isfinite(each.pit) for each in ranks.values()], axis=0)
     tables: dict[str, tuple[type[enum.IntEnum], Mapping[str, str]]] = {
-        "status": (Status, STATUSES),
+        "status": (Status, STATUS_MEANINGS),
         "method": (MethodUsed, text.METHODS_USED),
     }
     for name, (known, meanings) in tables.items():

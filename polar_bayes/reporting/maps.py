@@ -37,15 +37,18 @@ from polar_bayes.reporting.style import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMIL
 from polar_bayes.reporting.text import DASH, METHODS_USED, SLIGHT, count_percent, number
 from polar_bayes.repr_html import Row, Table
 
+NO_ANSWER = "#dadada"
 STATUSES = {
-    "good": "an answer that the checks let pass",
-    "masked": "no valid reading",
-    "too few views": f"fewer than {MIN_VIEWS} valid views",
-    "not converged": "no answer was reached; NaN",
-    "not trusted": "numbers that no check confirms, by the method in the next table",
-    "contradicted": "numbers of a good posterior, whose model the readings contradict",
-    "not fitted": "called good without finite numbers, or never written",
+    "good": (BLUE, "an answer that the checks let pass"),
+    "masked": (NO_ANSWER, "no valid reading"),
+    "too few views": (SKY, f"fewer than {MIN_VIEWS} valid views"),
+    "not converged": (VERMILLION, "no answer was reached; NaN"),
+    "not trusted": (ORANGE, "numbers that no check confirms, by the method in the next table"),
+    "contradicted": (GREEN, "numbers of a good posterior, whose model the readings contradict"),
+    "not fitted": (PURPLE, "called good without finite numbers, or never written"),
 }
+"""Color and meaning of each status of a pixel."""
+STATUS_MEANINGS = {status: meaning for status, (_, meaning) in STATUSES.items()}
 CHECKS = {
     "priors": "medians in the tails of their priors",
     "noise": "scatter above its prior, or three times the stated errors",
@@ -55,17 +58,6 @@ CHECKS = {
 }
 
 # --- Figures --------------------------------------------------------------------------------------
-
-NO_ANSWER = "#dadada"
-STATUS_COLORS = {
-    "good": BLUE,
-    "masked": NO_ANSWER,
-    "too few views": SKY,
-    "not converged": VERMILLION,
-    "not trusted": ORANGE,
-    "contradicted": GREEN,
-    "not fitted": PURPLE,
-}
 
 
 @style.styled
@@ -109,7 +101,7 @@ def plot_maps(maps: xr.Dataset, *, wavelength: float | None = None) -> Figure:
     _draw_values(panel(2, 0), shown["pareto_k"], "Pareto k", "magma", limits=(0.0, 1.0))
     _draw_flags(panel(2, 1), shown["method"], (NO_ANSWER, SKY, BLUE, GREEN, ORANGE, PURPLE))
     status = checked_status(shown)
-    colors = [STATUS_COLORS.get(each, NO_ANSWER) for each in flag_meanings(status).values()]
+    colors = [STATUSES.get(each, (NO_ANSWER,))[0] for each in flag_meanings(status).values()]
     _draw_flags(panel(2, 2), status, colors)
     return figure
 
@@ -351,7 +343,7 @@ def shown_wavelengths(maps: xr.Dataset) -> list[float]:
 
 def _pixel_tables(counts: pd.DataFrame) -> Iterator[Table]:
     """Return tables of pixels by status, and by method with the share that is good."""
-    yield count_table("map.status", counts.sum(axis=1).to_frame("pixels"), STATUSES)
+    yield count_table("map.status", counts.sum(axis=1).to_frame("pixels"), STATUS_MEANINGS)
     good = counts.loc["good"] if "good" in counts.index else 0 * counts.sum()
     data = pd.DataFrame({"pixels": counts.sum(), "good": good})
     yield count_table("map.method", data, METHODS_USED)
