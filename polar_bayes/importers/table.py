@@ -299,24 +299,12 @@ def capture_of_lines(
 
 def _spectral(values: dict[str, np.ndarray], waves: np.ndarray) -> xr.Dataset:
     """Arrange lines of several wavelengths; views are masked at wavelengths they lack."""
-    label, column = np.unique(waves, return_inverse=True)
-    view = _views(values, column)
-    first = np.unique(view, return_index=True)[1]
-    variables: dict[str, tuple] = {}
-    for name, x in {"valid": np.ones(len(view)), **values}.items():
-        if name in PER_VIEW:
-            variables[name] = ("view", x[first])
-            continue
-        is_flag = name in KNOWN and KNOWN[name].kind == "flag"
-        filled = np.full((len(first), len(label)), 0.0 if is_flag else np.nan)
-        filled[view, column] = x
-        variables[name] = (("view", "wavelength"), filled)
-    return xr.Dataset(variables, {"wavelength": label})
-
-
-def _views(values: dict[str, np.ndarray], column: np.ndarray) -> np.ndarray:
-    """Return the view of each line: one for each set of directions and each repetition."""
-    directions = {name: values[name] for name in PER_VIEW if name in values}
-    lines = pd.DataFrame({**directions, "column": column})
-    lines["repetition"] = lines.groupby([*lines], sort=False).cumcount()
-    return lines.groupby([*directions, "repetition"], sort=False).ngroup().to_numpy()
+    lines = pd.DataFrame({"valid": 1.0, **values, "wavelength": waves}, dtype=float)
+    directions = [name for name in PER_VIEW if name in values]
+    # One view for each set of directions, and for each repetition of it.
+    repetition = lines.groupby([*directions, "wavelength"], sort=False).cumcount()
+    lines["view"] = lines.groupby([*directions, repetition], sort=False).ngroup()
+    views = xr.Dataset.from_dataframe(lines.groupby("view")[directions].first())
+    readings = lines.drop(columns=directions).set_index(["view", "wavelength"])
+    unread = {name: 0.0 for name in readings if name in KNOWN and KNOWN[name].kind == "flag"}
+    return views.merge(xr.Dataset.from_dataframe(readings).fillna(unread)).drop_vars("view")

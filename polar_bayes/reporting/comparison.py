@@ -1,5 +1,6 @@
 """Report of several fits of one capture: predictive accuracy and differences of intervals."""
 
+import operator
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -15,7 +16,7 @@ from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.fit_page import fit_card
 from polar_bayes.reporting.style import BLUE, GRAY, GREEN, ORANGE, PURPLE, SKY, VERMILLION
-from polar_bayes.reporting.text import DASH, column, interval, number, or_dash, percent
+from polar_bayes.reporting.text import DASH, column, digits, ends, or_dash, share
 from polar_bayes.repr_html import Row, Table
 from polar_bayes.scenes.sentences import CLEAR
 
@@ -103,9 +104,9 @@ def loo_table(comparison: FitComparison) -> Table:
     cells: page.Cells = {
         "elpd": lambda row: f"{row['elpd']:.1f} ± {or_dash(row['se'], '.1f')}",
         "difference": text.elpd_difference,
-        "p": lambda row: f"{row['p']:.1f}",
-        "weight": lambda row: f"{row['weight']:.2f}",
-        "k > 0.7": lambda row: f"{int(row['unreliable'])}",
+        "p": column("p", ".1f"),
+        "weight": column("weight", ".2f"),
+        "k > 0.7": column("unreliable", ".0f"),
     }
     return page.make_table("comparison.loo", cells, comparison.loo, label="fit", clear=CLEAR)
 
@@ -114,9 +115,9 @@ def parameter_table(comparison: FitComparison) -> Table:
     """Return a table of every parameter by every fit."""
     cells: page.Cells = {
         "fit": page.second_label,
-        "mean": lambda row: number(row["mean"], row["sd"]),
-        "sd": lambda row: number(row["sd"], row["sd"]),
-        "95% interval": lambda row: interval(row["q2.5"], row["q97.5"], row["sd"]),
+        "mean": digits("mean"),
+        "sd": digits("sd"),
+        "95% interval": ends(scale=operator.itemgetter("sd")),
         "R-hat": column("r_hat", ".3f"),
         "ESS": lambda row: or_dash(np.floor(row["ess_bulk"]), ".0f"),
     }
@@ -130,7 +131,7 @@ def sensitivity_table(comparison: FitComparison) -> Table | None:
         return None
     cells: page.Cells = {
         "fit": page.second_label,
-        "prior inside": lambda row: percent(row["prior_inside"]),
+        "prior inside": share("prior_inside"),
         "by the data": lambda row: str(row["verdict"]),
         **text.SENSITIVITY_CELLS,
     }

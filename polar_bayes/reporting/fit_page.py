@@ -39,7 +39,18 @@ from polar_bayes.reporting import page, plots_curves, plots_fit, text
 from polar_bayes.reporting.accuracy import accuracy_picture, study_table
 from polar_bayes.reporting.page import Section
 from polar_bayes.reporting.style import QUANTITIES, parameter_title
-from polar_bayes.reporting.text import DASH, column, interval, number, or_dash, percent
+from polar_bayes.reporting.text import (
+    DASH,
+    column,
+    digits,
+    ends,
+    interval,
+    number,
+    or_dash,
+    percent,
+    quarter,
+    share,
+)
 from polar_bayes.repr_html import Row, Table
 from polar_bayes.results import summary, verdict
 from polar_bayes.scenes.sentences import scene_sentences, scene_table
@@ -175,12 +186,12 @@ def parameter_table(fit: FitView) -> Table:
     if fit.method == "point":
         return _estimate_table(fit)
     cells: page.Cells = {
-        "mean": lambda row: number(row["mean"], row["sd"]),
-        "sd": lambda row: number(row["sd"], row["sd"]),
-        "2.5%": lambda row: number(row["q2.5"], row["sd"]),
-        "97.5%": lambda row: number(row["q97.5"], row["sd"]),
+        "mean": digits("mean"),
+        "sd": digits("sd"),
+        "2.5%": digits("q2.5"),
+        "97.5%": digits("q97.5"),
         TRUTH: _truth_cell,
-        "prior inside": lambda row: percent(row["prior_inside"]),
+        "prior inside": share("prior_inside"),
         "by the data": lambda row: str(row["verdict"]),
     }
     data = convergence.summary(fit).join(sensitivity(fit)[["prior_inside", "verdict"]])
@@ -195,14 +206,11 @@ def _truth_cell(row: pd.Series) -> str:
 
 
 def _estimate_table(fit: FitView) -> Table:
-    def error(row: pd.Series) -> str:
-        size = row["standard_error"]
-        return number(size, size) if math.isfinite(size) else "not determined"
-
+    error = digits("standard_error", "standard_error")
     cells: page.Cells = {
-        "estimate": lambda row: number(row["estimate"], row["standard_error"]),
-        "standard error": error,
-        TRUTH: lambda row: number(row["true_value"], row["standard_error"]),
+        "estimate": digits("estimate", "standard_error"),
+        "standard error": lambda row: error(row).replace(DASH, "not determined"),
+        TRUTH: digits("true_value", "standard_error"),
     }
     data = convergence.summary(fit)[["mean", "sd"]]
     data = data.set_axis(["estimate", "standard_error"], axis="columns")
@@ -212,9 +220,9 @@ def _estimate_table(fit: FitView) -> Table:
 def sensitivity_table(fit: FitView) -> Table:
     """Return a table of prior against posterior, with power-scaling sensitivities."""
     cells: page.Cells = {
-        "prior 95%": lambda row: interval(row["prior_q2.5"], row["prior_q97.5"]),
-        "posterior 95%": lambda row: interval(row["q2.5"], row["q97.5"]),
-        "width left": lambda row: percent(row["width_left"]),
+        "prior 95%": ends("prior_q2.5", "prior_q97.5"),
+        "posterior 95%": ends(),
+        "width left": share("width_left"),
         **text.SENSITIVITY_CELLS,
     }
     options = {"prose": ["remark"], "sensitive": LIMITS.sensitive}
@@ -245,7 +253,7 @@ def _scenes(result: xr.DataTree) -> Iterator[page.Block]:
     cells: page.Cells = {
         "elpd": column("elpd", ".1f"),
         "difference": text.elpd_difference,
-        "weight": lambda row: percent(row["weight"]),
+        "weight": share("weight"),
         **{name: operator.itemgetter(name) for name in texts},
         "criticism": lambda row: row["criticism"] or DASH,
     }
@@ -333,7 +341,7 @@ def population_table(fit: FitView) -> Table:
         "members differ by": lambda row: (
             str(row["meaning"]).removeprefix("members differ by ") or DASH
         ),
-        "a new member": lambda row: interval(row["new_q2.5"], row["new_q97.5"]),
+        "a new member": ends("new_q2.5", "new_q97.5"),
         "pooling factor": column("pooling", ".2f"),
     }
     scales = {"log": "the scale of its logarithm", "log odds": "the scale of its log odds"}
@@ -353,15 +361,12 @@ def member_table(fit: FitView) -> Table:
         for scalar in each.members
     }
 
-    def scale(row: pd.Series) -> float:
-        return (row["q97.5"] - row["q2.5"]) / 4.0
-
     cells: page.Cells = {
-        "mean": lambda row: number(row["mean"], scale(row)),
-        "95% interval": lambda row: interval(row["q2.5"], row["q97.5"]),
-        "alone": lambda row: number(row["unpooled"], scale(row)),
-        "95% alone": lambda row: interval(row["unpooled_q2.5"], row["unpooled_q97.5"], scale(row)),
-        "pooled share": lambda row: percent(row["shrinkage"]),
+        "mean": digits("mean", quarter),
+        "95% interval": ends(),
+        "alone": digits("unpooled", quarter),
+        "95% alone": ends("unpooled_q2.5", "unpooled_q97.5", quarter),
+        "pooled share": share("shrinkage"),
     }
     data = shrinkage(fit).loc[list(titles)]
     return page.make_table("fit.member", cells, data, descriptions=titles)
@@ -399,15 +404,15 @@ def discrepancy_table(fit: FitView, compared: pd.DataFrame, part: str, name: str
     """Return a table of the fit next to a fit without a part of the instrument."""
 
     def scale(row: pd.Series) -> float:
-        return min(row["q97.5"] - row["q2.5"], row["q97.5_without"] - row["q2.5_without"]) / 4.0
+        return min(quarter(row), (row["q97.5_without"] - row["q2.5_without"]) / 4.0)
 
     cells: page.Cells = {
-        "mean": lambda row: number(row["mean"], scale(row)),
-        "95% interval": lambda row: interval(row["q2.5"], row["q97.5"], scale(row)),
-        "mean without": lambda row: number(row["mean_without"], scale(row)),
-        "95% without": lambda row: interval(row["q2.5_without"], row["q97.5_without"], scale(row)),
-        "width": lambda row: percent(row["width_ratio"]),
-        TRUTH: lambda row: number(row["true_value"], scale(row)),
+        "mean": digits("mean", scale),
+        "95% interval": ends(scale=scale),
+        "mean without": digits("mean_without", scale),
+        "95% without": ends("q2.5_without", "q97.5_without", scale),
+        "width": share("width_ratio"),
+        TRUTH: digits("true_value", scale),
     }
     return fit_table(fit, "fit.without", cells, compared, name=name, part=part)
 

@@ -1,7 +1,7 @@
 """Report of a map: status of its pixels, figures, parameters, and coverage where known."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +34,7 @@ from polar_bayes.physics.part import notation
 from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.fit_page import INSTRUMENT_GROUP, provenance_facts
 from polar_bayes.reporting.style import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
-from polar_bayes.reporting.text import DASH, METHODS_USED, SLIGHT, count_percent, number
+from polar_bayes.reporting.text import DASH, METHODS_USED, SLIGHT, count_percent, digits, quarter
 from polar_bayes.repr_html import Row, Table
 
 NO_ANSWER = "#dadada"
@@ -389,13 +389,9 @@ def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> Table:
         ends = np.quantile(mean, [0.05, 0.95]).tolist() if mean.size else [math.nan] * 2
         data[scalar.label] = [median, *ends, *medians]
     columns = ["median", "5% below", "5% above", "typical sd", "95% width"]
-
-    def cell(column: str) -> Callable[[pd.Series], str]:
-        return lambda row: number(row[column], row["typical sd"])
-
     return page.make_table(
         "map.parameter",
-        {column: cell(column) for column in columns},
+        {column: digits(column, "typical sd") for column in columns},
         pd.DataFrame.from_dict(data, orient="index", columns=columns),
         descriptions={scalar.label: title for scalar, title in titles.items()},
         groups={scalar.label: _group(scalar) for scalar in titles},
@@ -404,15 +400,10 @@ def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> Table:
 
 def shared_table(shared: pd.DataFrame) -> Table:
     """Return a table of the parameters that all pixels share."""
-    width = (shared["q97.5"] - shared["q2.5"]) / 4.0
-
-    def cell(column: str) -> Callable[[pd.Series], str]:
-        return lambda row: number(row[column], width[row.name])
-
     return page.make_table(
         "map.shared",
         {
-            **{column: cell(column) for column in ("q2.5", "q50", "q97.5")},
+            **{column: digits(column, quarter) for column in ("q2.5", "q50", "q97.5")},
             "pixels": text.column("pixels", ",.0f"),
             "disagreement": text.column("disagreement", ".1f"),
         },

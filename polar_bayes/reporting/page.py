@@ -65,7 +65,7 @@ def report_of(result: object) -> Report:
 
 
 type Cells = Mapping[str, Callable[[pd.Series], str]]
-"""Columns of a table: the text of a cell from its row of numbers."""
+"""Columns of a table: the text of a cell from its row of numbers (`polar_bayes.reporting.text`)."""
 
 
 def make_table(
