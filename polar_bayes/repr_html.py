@@ -12,13 +12,16 @@ import importlib.resources
 import inspect
 import io
 import re
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any, Self, TextIO, override
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Self, TextIO, override
 
 import rich.table
 from rich.console import Console
 
 from polar_bayes.errors import one_line
+
+if TYPE_CHECKING:
+    from polar_bayes.frames import Frame
 
 WARNING = re.compile(r"not determined|.*\((outside|too few|fails)\)")
 """Cells that pages show in red."""
@@ -47,6 +50,14 @@ class Table:
     name: str = ""
     caption: str = ""
     data: Any = None  # pandas.DataFrame
+
+    @classmethod
+    def of_frame(
+        cls, frame: "Frame", text: Callable[[object], str], prose: Collection[str] = ()
+    ) -> Self:
+        """Return the table of a data frame, each cell as a text."""
+        rows = (Row(str(label), tuple(map(text, cells))) for label, *cells in frame.itertuples())
+        return cls(("", *frame.columns), tuple(rows), prose)
 
     def first(self, count: int) -> Self:
         """Return the table with its first rows only."""

@@ -268,13 +268,10 @@ def _fit_tables(calibration: xr.DataTree, ranks: Mapping[str, Ranks]) -> Iterato
             continue
         names = " ".join(each.name.lower() for each in known)
         flags = fits[name].assign_attrs({"flag_meanings": names} | fits[name].attrs)
-        counts = {}
-        for value, meaning in flag_meanings(flags).items():
-            chosen = flags.to_numpy() == value
-            if chosen.any():
-                counts[meaning] = [int(chosen.sum()), int(answered[chosen].sum())]
-        data = pd.DataFrame.from_dict(counts, orient="index", columns=["fits", "with ranks"])
-        yield count_table(f"calibration.{name}", data, meanings)
+        known_flags = flag_meanings(flags)
+        found = pd.DataFrame({"fits": 1, "with ranks": answered.astype(int)}, flags.to_numpy())
+        counts = found.groupby(level=0).sum().reindex(list(known_flags)).dropna().astype(int)
+        yield count_table(f"calibration.{name}", counts.rename(known_flags), meanings)
 
 
 def _fit_facts(calibration: xr.DataTree) -> dict[str, str]:

@@ -44,7 +44,7 @@ def plot_comparison(comparison: FitComparison) -> Figure:
         raise FitError(
             "there is nothing to draw", where="plot_comparison", hint="give fits with finite draws"
         )
-    colors = {name: COLORS[at % len(COLORS)] for at, name in enumerate(fits)}
+    colors = style.in_turn(fits, COLORS)
     figure, panels = style.grid(len(labels), panel_height=0.55 + 0.2 * len(fits), header=0.4)
     for axes, label in zip(panels, labels, strict=True):
         for name, row in finite.xs(label, level="parameter").iterrows():
@@ -102,7 +102,7 @@ def comparison_page(fits: Mapping[str, xr.DataTree]) -> page.Page:
 def loo_table(comparison: FitComparison) -> Table:
     """Return a table of expected log densities, best first."""
     cells: page.Cells = {
-        "elpd": lambda row: f"{row['elpd']:.1f} ± {or_dash(row['se'], '.1f')}",
+        "elpd": text.elpd("se"),
         "difference": text.elpd_difference,
         "p": column("p", ".1f"),
         "weight": column("weight", ".2f"),

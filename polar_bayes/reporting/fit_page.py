@@ -32,7 +32,6 @@ from polar_bayes.diagnostics.view import FitView, Provenance, view_of
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.checks import CAUTION, PROBLEM
 from polar_bayes.inference.files import sentences_of_auto
-from polar_bayes.methods.registry import METHODS
 from polar_bayes.numerics.psis import MAX_PARETO_K
 from polar_bayes.priors import short_numbers
 from polar_bayes.reporting import page, plots_curves, plots_fit, text
@@ -136,12 +135,13 @@ def fit_page(result: xr.DataTree | FitView) -> page.Page:
         Section("accuracy", "Accuracy against time", _accuracy(fit.result)),
         Section("provenance", "Provenance", [*provenance_facts(fit.provenance), source]),
     ]
-    method = METHODS[fit.method].label if fit.method in METHODS else one_line(fit.method)
-    swapped = text.swapped_sentence(fit.provenance)
     return page.Page(
         kind="Fit report",
         name=text.capture_name(fit.provenance),
-        subtitles=[text.made_by(fit.provenance, method), *filter(None, [swapped])],
+        subtitles=[
+            text.made_by(fit.provenance, text.method_label(fit.method)),
+            text.swapped_sentence(fit.provenance),
+        ],
         headline=text.fit_headline(fit),
         passed=judged.passed,
         problems=judged.problems,
@@ -487,7 +487,7 @@ def check_table(checks: Mapping[str, PredictiveCheck]) -> Table:
     if any(check.pit.size for check in checks.values()):
         cells |= {f"inside {p:.0%}": _coverage_cell(p) for p in PROBABILITIES}
         cells |= {
-            "elpd": _elpd_cell,
+            "elpd": text.elpd("elpd_error"),
             "p": column("p_loo", ".1f"),
             "k > 0.7": column("unreliable", ".0f"),
         }
@@ -504,12 +504,6 @@ def _check_numbers(check: PredictiveCheck) -> dict[str, float]:
         names = ("elpd", "standard_error", "p_loo", "unreliable")
         numbers |= {name: getattr(check.loo, name, math.nan) for name in names}
     return numbers
-
-
-def _elpd_cell(row: pd.Series) -> str:
-    if not math.isfinite(row["elpd"]):
-        return DASH
-    return f"{row['elpd']:.1f} ± {or_dash(row['elpd_error'], '.1f')}"
 
 
 def _coverage_cell(probability: float) -> Callable[[pd.Series], str]:

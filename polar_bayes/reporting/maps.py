@@ -29,7 +29,7 @@ from polar_bayes.maps.lazy import (
     shared_parameters,
     start_sentences,
 )
-from polar_bayes.methods.registry import MAP_DEFAULT, METHODS
+from polar_bayes.methods.registry import MAP_DEFAULT
 from polar_bayes.physics.part import notation
 from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.fit_page import INSTRUMENT_GROUP, provenance_facts
@@ -232,8 +232,7 @@ def map_page(
     maps, provenance = ensure_loaded(maps), provenance_of(maps)
     counts = count_cases(maps)
     headline, passed = text.map_headline(counts)
-    name = str(provenance.get("method", MAP_DEFAULT))
-    method = METHODS[name].label if name in METHODS else one_line(name)
+    method = str(provenance.get("method", MAP_DEFAULT))
     size = " x ".join(f"{maps.sizes[dim]:,}" for dim in IMAGE)
     sentences = [
         *text.pixel_sentences(counts),
@@ -244,41 +243,40 @@ def map_page(
     if truth is not None:
         conclusions, coverage = _coverage(maps, titles, truth, uncorrected)
         sentences += conclusions
-    regions = page.caption("map.regions")
-    tables: list[page.Block] = [parameter_table(maps, titles), regions]
     shared = shared_parameters(maps)
-    if not shared.empty:
-        tables.append(shared_table(shared))
+    tables = [
+        parameter_table(maps, titles),
+        page.caption("map.regions"),
+        None if shared.empty else shared_table(shared),
+    ]
+    explorer = text.no_explorer()
+    if page.has_explorer():
+        explorer = page.block("link", "The same map to point at, pixel by pixel.", page.EXPLORER)
     sections = [
-        page.Section("maps", "Maps", [_explorer(), *_pictures(maps, list(titles))]),
+        page.Section("maps", "Maps", [explorer, *_pictures(maps, list(titles))]),
         page.Section("pixels", "Pixels", [*_pixel_tables(counts), *_criticism_table(maps)]),
         page.Section("parameters", "Parameters", tables),
         page.Section("coverage", "Coverage", coverage),
         page.Section("provenance", "Provenance", provenance_facts(provenance)),
     ]
-    swapped = text.swapped_sentence(provenance)
     return page.Page(
         kind="Map report",
         name=map_name(maps, truth),
-        subtitles=[f"{size} pixels. {text.made_by(provenance, method)}", *filter(None, [swapped])],
+        subtitles=[
+            f"{size} pixels. {text.made_by(provenance, text.method_label(method))}",
+            text.swapped_sentence(provenance),
+        ],
         headline=headline,
         passed=passed,
         sentences=sentences,
         cautions=[
-            *([page.caption("map.unchecked")] if name == UNCHECKED else []),
+            *([page.caption("map.unchecked")] if method == UNCHECKED else []),
             *shared_cautions(maps),
             *perfect_cautions(maps),
         ],
         sections=sections,
         footer="Computed from the maps of every pixel, which stay where they are.",
     )
-
-
-def _explorer() -> page.Block:
-    """Where the map is that one can point at, or why there is none."""
-    if page.has_explorer():
-        return page.block("link", "The same map to point at, pixel by pixel.", page.EXPLORER)
-    return text.no_explorer()
 
 
 def _check_uncorrected(maps: xr.Dataset, truth: xr.Dataset | None, uncorrected: xr.Dataset) -> None:

@@ -121,6 +121,12 @@ def ends(
     return lambda row: interval(row[name], row[other], scale(row))
 
 
+def elpd(error: str) -> Cell:
+    """Return a cell: an expected log density with its standard error, which is another column."""
+    form = column(error, ".1f")
+    return lambda row: f"{row['elpd']:.1f} ± {form(row)}" if math.isfinite(row["elpd"]) else DASH
+
+
 def elpd_difference(row: pd.Series) -> str:
     """Format the difference in expected log density to the best, with standard error."""
     if row["dse"] == 0.0:
@@ -176,6 +182,11 @@ def fit_headline(fit: FitView) -> str:
         against = "but the readings speak against the model: do not use these intervals."
         return f"{name} {passed}, {against}"
     return f"{name} {passed}." + (" Mind the cautions." if verdict.cautions else "")
+
+
+def method_label(method: str) -> str:
+    """Return the name of a method for readers."""
+    return METHODS[method].label if method in METHODS else one_line(method)
 
 
 def made_by(provenance: Provenance, method: str) -> str:
