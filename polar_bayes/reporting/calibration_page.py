@@ -77,7 +77,7 @@ def calibration_page(
     estimates = _paged(shown, figures.estimates, "estimates", max_intervals=MAX_INTERVALS)
     simulations = next(iter(ranks.values())).pit.size
     elsewhere = " What it is compared with stays where it is." if others else ""
-    fits = [*_fit_tables(tree, ranks), page.facts(_fit_facts(tree))]
+    fits: list[page.Block] = [*_fit_tables(tree, ranks), page.facts(_fit_facts(tree))]
     sections = [
         page.Section("parameters", "Parameters", [introduction, rank_table(table, ranks)]),
         page.Section("comparison", "Comparison with other methods", comparison),

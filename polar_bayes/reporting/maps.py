@@ -244,7 +244,7 @@ def map_page(
         conclusions, coverage = _coverage(maps, titles, truth, uncorrected)
         sentences += conclusions
     shared = shared_parameters(maps)
-    tables = [
+    tables: list[page.Block | None] = [
         parameter_table(maps, titles),
         page.caption("map.regions"),
         None if shared.empty else shared_table(shared),
