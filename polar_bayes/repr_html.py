@@ -6,43 +6,22 @@ log and a saved result show the expression that makes the value.
 """
 
 import dataclasses
+import functools
 import html
+import importlib.resources
 import inspect
 import io
 import re
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any, Self, TextIO, override
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Self, TextIO, override
 
 import rich.table
 from rich.console import Console
 
 from polar_bayes.errors import one_line
 
-STYLE = """<style>
-.pb-card { font: 13px/1.45 system-ui, sans-serif; max-width: 62em; overflow-x: auto;
-  padding: .5em .9em; border: 1px solid rgba(128, 128, 128, .4); border-radius: 6px; }
-.pb-card h4 { font-size: 1.08em; margin: 0 0 .2em; }
-.pb-card p { margin: .25em 0; max-width: 52em; }
-.pb-card small { opacity: .72; }
-.pb-card table { border-collapse: collapse; margin: .3em 0; font: inherit;
-  font-variant-numeric: tabular-nums; }
-.pb-card table :is(td, th) { text-align: right; vertical-align: top; padding: .1em 1.1em .1em 0;
-  background: none; border: 0; border-top: 1px solid rgba(128, 128, 128, .22);
-  white-space: nowrap; max-width: none; }
-.pb-card table :is(.prose, th:first-child) { text-align: left; }
-.pb-card table td.prose { white-space: normal; }
-.pb-card thead th { border-top: 0; }
-.pb-card tbody th { font-weight: 500; }
-.pb-card th small { display: block; font-weight: 400; }
-.pb-card th[scope="rowgroup"] { font-style: italic; }
-.pb-card td.warning { color: #d55e00; font-weight: 600; }
-.pb-card details { display: inline-block; vertical-align: top; }
-.pb-card summary { cursor: pointer; }
-.pb-card.good { border-left: 5px solid #009e73; }
-.pb-card.bad { border-left: 5px solid #d55e00; }
-</style>"""
-"""Style that each representation repeats, since a notebook may show any of them alone."""
-
+if TYPE_CHECKING:
+    from polar_bayes.frames import Frame
 
 WARNING = re.compile(r"not determined|.*\((outside|too few|fails)\)")
 """Cells that pages show in red."""
@@ -71,6 +50,14 @@ class Table:
     name: str = ""
     caption: str = ""
     data: Any = None  # pandas.DataFrame
+
+    @classmethod
+    def of_frame(
+        cls, frame: "Frame", text: Callable[[object], str], prose: Collection[str] = ()
+    ) -> Self:
+        """Return the table of a data frame, each cell as a text."""
+        rows = (Row(str(label), tuple(map(text, cells))) for label, *cells in frame.itertuples())
+        return cls(("", *frame.columns), tuple(rows), prose)
 
     def first(self, count: int) -> Self:
         """Return the table with its first rows only."""
@@ -165,8 +152,14 @@ class HTMLRepr:
 
 
 def _card(inside: str, good: bool | None = None) -> str:
+    """Return a card with its style, for a notebook may show any of them alone."""
     kind = {None: "", True: " good", False: " bad"}[good]
-    return f'<div class="pb-card{kind}">{STYLE}{inside}</div>'
+    return f'<div class="pb-card{kind}"><style>\n{_style()}</style>{inside}</div>'
+
+
+@functools.cache
+def _style() -> str:
+    return importlib.resources.files("polar_bayes").joinpath("card.css").read_text("utf-8")
 
 
 def _escaped(text: object) -> str:

@@ -87,7 +87,7 @@ class Variable:
     needs: str | None = None
 
 
-ZENITH = Interval(0.0, 90.0, open_high=True)
+ZENITH, TURN = Interval(0.0, 90.0, open_high=True), Interval(-360.0, 360.0)
 UNIT = Interval(0.0, 1.0)
 SIGNED_UNIT = Interval(-1.0, 1.0)
 BRIGHTNESS = Interval(0.0, 1e30, open_high=True)
@@ -95,20 +95,10 @@ POSITIVE = Interval(0.0, 1e30, open_low=True, open_high=True)
 # The inverse square of an error stays finite in double precision.
 ERROR = Interval(1e-30, 1e30, open_low=True, open_high=True)
 
+FROM_NORMAL = "give degrees from the surface normal"
+AROUND_NORMAL = "give degrees around the surface normal"
 MASK = "correct it or mark it valid=False"
 FRACTION = f"give a fraction, not percent; {MASK}"
-
-
-def _direction(name: str) -> tuple[Variable, Variable]:
-    """Return the variable of a zenith or azimuth of viewer or light."""
-    hint, turns = "give degrees from the surface normal", Interval(-360.0, 360.0)
-    zenith, azimuth = f"{name} zenith angle", f"{name} azimuth"
-    return (
-        Variable(f"{name}_zenith", "geometry", "degree", ZENITH, zenith, hint),
-        Variable(
-            f"{name}_azimuth", "geometry", "degree", turns, azimuth, hint.replace("from", "around")
-        ),
-    )
 
 
 def _error(name: str, units: str | None) -> Variable:
@@ -122,8 +112,10 @@ def _flag(name: str, meaning: str) -> Variable:
 
 
 CONTRACT = (
-    *_direction("view"),
-    *_direction("light"),
+    Variable("view_zenith", "geometry", "degree", ZENITH, "view zenith angle", FROM_NORMAL),
+    Variable("view_azimuth", "geometry", "degree", TURN, "view azimuth", AROUND_NORMAL),
+    Variable("light_zenith", "geometry", "degree", ZENITH, "light zenith angle", FROM_NORMAL),
+    Variable("light_azimuth", "geometry", "degree", TURN, "light azimuth", AROUND_NORMAL),
     Variable(
         "normal_confidence",
         "trust",

@@ -9,7 +9,7 @@ import click
 
 import polar_bayes as pb
 from polar_bayes.cli.wording import as_commands
-from polar_bayes.repr_html import Row, Table
+from polar_bayes.repr_html import Table
 
 if TYPE_CHECKING:  # a command that needs no numbers loads no library of numbers
     from polar_bayes.frames import Frame
@@ -44,8 +44,7 @@ def json_rows(table: "Frame", orient: Literal["index", "records"] = "index") -> 
 
 def print_frame(frame: "Frame", sentences: Iterable[str] = ()) -> None:
     """Print a data frame with four digits and - for missing numbers, and sentences below."""
-    rows = (Row(str(label), tuple(map(_text, cells))) for label, *cells in frame.itertuples())
-    click.echo(Table(("", *frame.columns), tuple(rows)).to_text(sys.stdout))
+    click.echo(Table.of_frame(frame, _text).to_text(sys.stdout))
     if sentences:
         say("\n".join(["", *sentences]))
 

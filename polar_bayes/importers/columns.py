@@ -99,6 +99,11 @@ class Table:
         """Names of the columns; column_1, column_2, ... without a header line."""
         return tuple(self.columns)
 
+    @property
+    def places(self) -> list[str]:
+        """Each line, as errors name it."""
+        return [f"{self.source}: line {line}" for line in self.lines]
+
 
 def read_table(
     path: str | os.PathLike[str],
@@ -518,7 +523,7 @@ def _number(text: str) -> tuple[float, float, float] | None:
     if match is None or len(text) > 64:
         return None
     reading, error, digits = [each and each.replace(",", ".") for each in match.groups()]
-    value, step, stated = float(reading), _step(reading), math.nan
+    value, step, stated = float(reading), last_digit(reading), math.nan
     if error or digits:
         stated = float(error or digits) * (step if digits and "." not in digits else 1.0)
         if not 0.0 < stated < math.inf:
@@ -526,6 +531,6 @@ def _number(text: str) -> tuple[float, float, float] | None:
     return (value, step, stated) if math.isfinite(value) and 0.0 < step < math.inf else None
 
 
-def _step(digits: str) -> float:
+def last_digit(digits: str) -> float:
     """Return the value of the last printed digit of a number."""
     return float(f"1e{Decimal(digits).as_tuple().exponent}")

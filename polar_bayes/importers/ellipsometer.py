@@ -139,8 +139,8 @@ def _incidence(read: Table, values: Mapping[str, np.ndarray], angle_is: str | No
     if "angle" not in values:
         hint = "give its column, or degrees, by angle="
         raise CaptureError("nothing gives the angle", where=f"{read.source}: angle", hint=hint)
-    places = [f"{read.source}: line {line}" for line in read.lines]
-    return as_incidence(np.broadcast_to(values["angle"], (len(places), 1))[:, 0], angle_is, places)
+    angles = np.broadcast_to(values["angle"], (len(read.lines), 1))[:, 0]
+    return as_incidence(angles, angle_is, read.places)
 
 
 def _capture(
@@ -236,9 +236,8 @@ def _check_angles(read: Table, values: Mapping[str, np.ndarray], unit: str | Non
         if wrong.any():
             line, _ = np.argwhere(wrong)[0]
             what = f"{key} is {values[key][wrong][0]:g}, outside {low:g} to {high:g} degrees"
-            where = f"{read.source}: line {read.lines[line]}"
             hint = "check the column" if unit is None else "check unit="
-            raise CaptureError(what, where=where, hint=hint)
+            raise CaptureError(what, where=read.places[line], hint=hint)
     psi = values["psi"]
     if unit is None and psi.size > 2 and np.nanmax(psi) <= np.pi / 2.0 and np.ptp(psi) > 0.1:
         what = f"psi from {np.nanmin(psi):g} to {np.nanmax(psi):g} looks like radians"

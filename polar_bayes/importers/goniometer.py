@@ -37,7 +37,6 @@ import dataclasses
 import math
 import os
 from collections.abc import Collection, Mapping
-from decimal import Decimal
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,7 +49,7 @@ from scipy.optimize import nnls
 from polar_bayes.capture.plausibility import ASSUMED, indices_by_eye
 from polar_bayes.capture.schema import POSITIVE, Interval, validate
 from polar_bayes.errors import CaptureError
-from polar_bayes.importers.columns import Table, counted, read_table
+from polar_bayes.importers.columns import Table, counted, last_digit, read_table
 from polar_bayes.importers.mirror import as_incidence, mirror_views
 
 Readings = str | os.PathLike[str] | tuple[ArrayLike, ArrayLike]
@@ -504,14 +503,13 @@ def _rows_of(name: str, table: Table, angle: str, reading: str) -> Rows:
     if not np.isfinite(table.columns[reading]).any():
         where = f"{table.source}: column {reading}"
         raise CaptureError("no line has a reading", where=where, hint="name another column")
-    places = [f"{table.source}: line {line}" for line in table.lines]
     return Rows(
         name,
         table.columns[angle],
         table.columns[reading],
         table.steps[reading],
         table.errors[reading],
-        places,
+        table.places,
         [*table.notes],
     )
 
@@ -530,14 +528,9 @@ def _rows_of_arrays(name: str, readings: Any) -> Rows:
         what = f"{angle.size} angles and {reading.size} readings are no pair"
         raise CaptureError(what, where=name, hint="give one angle for each reading, at least one")
     printed = reading if reading.dtype.kind == "f" else reading.astype(np.float64)
-    finest = min(map(_last_digit, printed))  # the resolution of all readings
+    # The resolution of all readings, by the digits that each needs in its own precision.
+    finest = min(last_digit(np.format_float_positional(x, trim="-")) for x in printed)
     angle, reading = angle.astype(np.float64), reading.astype(np.float64)
     places = [f"{name}[row={row}]" for row in range(angle.size)]
     step, stated = np.full(angle.shape, finest), np.full(angle.shape, np.nan)
     return Rows(name, angle, reading, step, stated, places, [])
-
-
-def _last_digit(reading: np.floating) -> float:
-    """Return the value of the last digit needed to print a number in its own precision."""
-    digits = np.format_float_positional(reading, trim="-")
-    return float(f"1e{Decimal(digits).as_tuple().exponent}")

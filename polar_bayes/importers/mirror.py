@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from polar_bayes.capture.schema import ZENITH, check_choice
+from polar_bayes.capture.schema import FROM_NORMAL, ZENITH, check_choice
 from polar_bayes.errors import CaptureError
 
 ANGLE_IS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = MappingProxyType(
@@ -56,12 +56,13 @@ def as_incidence(
 
 def _guess(angle: np.ndarray, reading: np.ndarray | None) -> str:
     """Suggest the scale of angles that cannot be angles of incidence."""
-    hint = "give degrees from the surface normal"
     if np.nanmin(angle) < 0.0 and np.nanmax(np.abs(angle)) < 90.0:
         what = "a scan through zero" if np.nanmax(angle) > 0.0 else "the other side of the normal"
-        return f"{hint}; this looks like {what}: angle_is='incidence' takes the absolute value"
+        return (
+            f"{FROM_NORMAL}; this looks like {what}: angle_is='incidence' takes the absolute value"
+        )
     if np.nanmax(np.abs(angle)) > 180.0:
-        return hint
+        return FROM_NORMAL
     scales = ["two-theta", "deviation"]
     if np.nanmax(np.abs(angle)) == 90.0:
         scales.append("from-surface")
@@ -70,7 +71,7 @@ def _guess(angle: np.ndarray, reading: np.ndarray | None) -> str:
         grows = np.corrcoef(np.abs(angle[known]), reading[known])[0, 1] > 0.0
         scales = ["two-theta"] if grows else [each for each in scales if each != "two-theta"]
     names = " or ".join(f"angle_is='{each}'" for each in scales)
-    return f"{hint}; this looks like {names}"
+    return f"{FROM_NORMAL}; this looks like {names}"
 
 
 def mirror_views(incidence: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:

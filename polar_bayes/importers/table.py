@@ -28,8 +28,8 @@ import xarray as xr
 from polar_bayes.capture.combine import DIMS, PER_VIEW, combine
 from polar_bayes.capture.schema import (
     CONTRACT,
+    TURN,
     WAVELENGTH,
-    Interval,
     Variable,
     check_choice,
     hint_for,
@@ -42,7 +42,7 @@ from polar_bayes.importers.mirror import as_incidence
 
 KNOWN = {row.name: row for row in (*CONTRACT, WAVELENGTH)}
 KNOWN["aolp"] = Variable(
-    "aolp", "reading", "degree", Interval(-360.0, 360.0), "angle of linear polarization",
+    "aolp", "reading", "degree", TURN, "angle of linear polarization",
     "give degrees from the s axis, or from the p axis by aolp_from='p'", "dop",
 )  # fmt: skip
 AXES = {"s": 0.0, "p": 90.0}
@@ -111,17 +111,17 @@ def from_table(
         return list(dict.fromkeys(used[variable] for variable in order))
 
     read = read_table(table, chosen, sheet=sheet, wanted=[*given.values(), *ignored])
-    source, lines = read.source, read.lines
+    source = read.source
     values = {variable: read.columns[column] for variable, column in used.items()}
     if angle is not None:
-        places = [f"{source}: line {line}, column {angle}" for line in lines]
+        places = [f"{place}, column {angle}" for place in read.places]
         values["view_zenith"] = values["light_zenith"] = as_incidence(
             read.columns[angle], angle_is, places
         )
-    values |= {variable: np.full(len(lines), float(x)) for variable, x in constants.items()}
+    values |= {variable: np.full(len(read.lines), float(x)) for variable, x in constants.items()}
     values |= _stated_errors(read, used, values)
     notes = [*read.notes, *_mask_blanks(values, used, read)]
-    _check_values(values, used, lines, source)
+    _check_values(values, used, read)
     if "aolp" in values:
         values |= _normalized_stokes(values, AXES[aolp_from], source)
         notes.append(f"q and u follow from dop and aolp, which counts from {aolp_from}")
@@ -204,7 +204,7 @@ def _stated_errors(
             continue
         if (missing := ~stated & np.isfinite(values[variable])).any():
             what = f"it states no uncertainty, which {counted(int(stated.sum()), 'other')} do"
-            where = f"{read.source}: line {read.lines[int(np.argmax(missing))]}, column {column}"
+            where = f"{read.places[int(np.argmax(missing))]}, column {column}"
             raise CaptureError(what, where=where, hint="state that of every reading, or of none")
         found[name] = error
     return found
@@ -220,7 +220,7 @@ def _mask_blanks(
         if variable in KNOWN and KNOWN[variable].kind == "reading":
             blank |= missing
         elif missing.any() and not variable.startswith("true_"):
-            where = f"{read.source}: line {read.lines[int(np.argmax(missing))]}, column {column}"
+            where = f"{read.places[int(np.argmax(missing))]}, column {column}"
             hint = "fill it in, or take the line out (a # before it makes it a comment)"
             raise CaptureError(f"{variable} is blank", where=where, hint=hint)
     if not blank.any():
@@ -243,10 +243,10 @@ def _normalized_stokes(
 
 
 def _check_values(
-    values: Mapping[str, np.ndarray], columns: Mapping[str, str], lines: Sequence[int], source: str
+    values: Mapping[str, np.ndarray], columns: Mapping[str, str], read: Table
 ) -> None:
     """Check each number by the contract; readings are checked only where valid."""
-    valid = values.get("valid", np.ones(len(lines))) != 0.0
+    valid = values.get("valid", np.ones(len(read.lines))) != 0.0
     for variable in (name for name in values if name in KNOWN):
         row, numbers = KNOWN[variable], values[variable]
         wrong = ~row.range.contains(numbers) & (valid | (row.kind != "reading"))
@@ -254,7 +254,7 @@ def _check_values(
             first = int(np.argmax(wrong))
             column = f", column {columns[variable]}" if variable in columns else ""
             what = f"{variable} is {numbers[first]:g}, which is outside {row.range}"
-            where = f"{source}: line {lines[first]}{column}"
+            where = f"{read.places[first]}{column}"
             raise CaptureError(what, where=where, hint=hint_for(row, numbers[wrong]))
 
 
@@ -299,24 +299,12 @@ def capture_of_lines(
 
 def _spectral(values: dict[str, np.ndarray], waves: np.ndarray) -> xr.Dataset:
     """Arrange lines of several wavelengths; views are masked at wavelengths they lack."""
-    label, column = np.unique(waves, return_inverse=True)
-    view = _views(values, column)
-    first = np.unique(view, return_index=True)[1]
-    variables: dict[str, tuple] = {}
-    for name, x in {"valid": np.ones(len(view)), **values}.items():
-        if name in PER_VIEW:
-            variables[name] = ("view", x[first])
-            continue
-        is_flag = name in KNOWN and KNOWN[name].kind == "flag"
-        filled = np.full((len(first), len(label)), 0.0 if is_flag else np.nan)
-        filled[view, column] = x
-        variables[name] = (("view", "wavelength"), filled)
-    return xr.Dataset(variables, {"wavelength": label})
-
-
-def _views(values: dict[str, np.ndarray], column: np.ndarray) -> np.ndarray:
-    """Return the view of each line: one for each set of directions and each repetition."""
-    directions = {name: values[name] for name in PER_VIEW if name in values}
-    lines = pd.DataFrame({**directions, "column": column})
-    lines["repetition"] = lines.groupby([*lines], sort=False).cumcount()
-    return lines.groupby([*directions, "repetition"], sort=False).ngroup().to_numpy()
+    lines = pd.DataFrame({"valid": 1.0, **values, "wavelength": waves}, dtype=float)
+    directions = [name for name in PER_VIEW if name in values]
+    # One view for each set of directions, and for each repetition of it.
+    repetition = lines.groupby([*directions, "wavelength"], sort=False).cumcount()
+    lines["view"] = lines.groupby([*directions, repetition], sort=False).ngroup()
+    views = xr.Dataset.from_dataframe(lines.groupby("view")[directions].first())
+    readings = lines.drop(columns=directions).set_index(["view", "wavelength"])
+    unread = {name: 0.0 for name in readings if name in KNOWN and KNOWN[name].kind == "flag"}
+    return views.merge(xr.Dataset.from_dataframe(readings).fillna(unread)).drop_vars("view")

@@ -1,6 +1,5 @@
 """Report of an accuracy study: error of every method against time."""
 
-import itertools
 import math
 from collections.abc import Sequence
 
@@ -22,7 +21,6 @@ from polar_bayes.benchmark.advice import (
     accuracy_view,
     pareto_front,
 )
-from polar_bayes.errors import FitError
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.style import BLUE, GRAY, GREEN, ORANGE, PURPLE, SKY, VERMILLION
@@ -58,20 +56,14 @@ def plot_accuracy(result: Study, *, times: Sequence[str] | None = None) -> Figur
     study = accuracy_view(result)
     table = study.table
     shown = list(times) if times is not None else [t for t in TIME_LABELS if table[t].notna().any()]
-    unknown = [name for name in shown if name not in TIME_LABELS]
-    if unknown or not shown:
-        raise FitError(
-            f"there is no time {', '.join(unknown)}" if unknown else "no time was measured",
-            where="plot_accuracy",
-            hint=f"give some of {', '.join(TIME_LABELS)}",
-        )
+    style.check_shown(shown, TIME_LABELS, "time", "plot_accuracy")
     figure = style.NotebookFigure(figsize=(5.2 * len(shown), 4.4), layout="constrained")
     for at, name in enumerate(shown):
         axes = figure.add_subplot(1, len(shown), at + 1)
         front_panel(axes, study, name)
         if at == 0:
             axes.set_ylabel("largest error of a mean or sd [posterior sd]")
-    markers = _assign(table["override"], MARKERS)
+    markers = style.in_turn(table["override"], MARKERS)
     if len(markers) > 1:
         fills = [GRAY, *["none"] * (len(markers) - 1)]
         handles = [
@@ -88,7 +80,8 @@ def front_panel(axes: Axes, study: AccuracyView, time: str) -> None:
     table, noise = study.table, study.resolved
     # Logarithmic axes cannot show a time of zero.
     known = table[np.isfinite(table["error"]) & np.isfinite(table[time]) & (table[time] > 0.0)]
-    colors, markers = _assign(table["method"], COLORS), _assign(table["override"], MARKERS)
+    colors = style.in_turn(table["method"], COLORS)
+    markers = style.in_turn(table["override"], MARKERS)
     axes.set(xscale="log", yscale="log", xlabel=TIME_LABELS[time])
     axes.axhspan(1e-9, noise, color=style.lighten(GRAY, 0.85), lw=0, zorder=0)
     is_front = pareto_front(known[time].to_numpy(), known["error"].to_numpy())
@@ -107,11 +100,6 @@ def front_panel(axes: Axes, study: AccuracyView, time: str) -> None:
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))  # often less than a decade
     style.plain_numbers(axes.xaxis, axes.yaxis)
     _name_methods(axes, known, time, colors)
-
-
-def _assign(names: pd.Series, values: Sequence[str]) -> dict[str, str]:
-    """Assign a color or marker to each distinct name."""
-    return dict(zip(dict.fromkeys(names), itertools.cycle(values), strict=False))
 
 
 def _name_methods(axes: Axes, known: pd.DataFrame, time: str, colors: dict[str, str]) -> None:
@@ -150,14 +138,12 @@ def _name_methods(axes: Axes, known: pd.DataFrame, time: str, colors: dict[str, 
 def accuracy_page(result: xr.DataTree) -> page.Page:
     """Return the page of an accuracy study."""
     study, provenance = accuracy_view(result), provenance_of(result)
-    facts = page.make_facts(
-        {str(key).replace("_", " "): value for key, value in provenance.items()}
-    )
+    facts = {str(key).replace("_", " "): value for key, value in provenance.items()}
     sections = [
         page.Section("front", "Error against time", [accuracy_picture(study)]),
         page.Section("methods", "Methods and settings", [study_table(study)]),
         page.Section("parameters", "Errors of every parameter", [error_table(study)]),
-        page.Section("provenance", "Provenance", facts),
+        page.Section("provenance", "Provenance", [page.facts(facts)]),
     ]
     return page.Page(
         kind="Accuracy against time",
@@ -178,7 +164,7 @@ def accuracy_card(result: xr.DataTree) -> page.Card:
     return sentences, study_table(study), not study.doubts
 
 
-def accuracy_picture(study: AccuracyView) -> page.Picture:
+def accuracy_picture(study: AccuracyView) -> str:
     """Plot error against time."""
     return page.picture(plot_accuracy(study), "accuracy.figure_front")
 

@@ -35,7 +35,7 @@ from polar_bayes.numerics.psis import MAX_PARETO_K
 from polar_bayes.priors import short_numbers
 from polar_bayes.reporting import page, text
 from polar_bayes.reporting import plots_calibration as figures
-from polar_bayes.reporting.maps import STATUSES, count_table, flag_meanings
+from polar_bayes.reporting.maps import STATUS_MEANINGS, count_table, flag_meanings
 from polar_bayes.reporting.plots_calibration import MAX_INTERVALS, Ranks
 from polar_bayes.reporting.style import MAX_PANELS, QUANTITIES
 from polar_bayes.reporting.text import DASH, column, number
@@ -77,7 +77,7 @@ def calibration_page(
     estimates = _paged(shown, figures.estimates, "estimates", max_intervals=MAX_INTERVALS)
     simulations = next(iter(ranks.values())).pit.size
     elsewhere = " What it is compared with stays where it is." if others else ""
-    fits = [*_fit_tables(tree, ranks), *page.make_facts(_fit_facts(tree))]
+    fits: list[page.Block] = [*_fit_tables(tree, ranks), page.facts(_fit_facts(tree))]
     sections = [
         page.Section("parameters", "Parameters", [introduction, rank_table(table, ranks)]),
         page.Section("comparison", "Comparison with other methods", comparison),
@@ -136,7 +136,7 @@ def _others(given: Mapping[str, xr.DataTree], method: str) -> dict[str, Calibrat
 
 def _paged(
     ranks: Sequence[Ranks], draw: Callable[[Sequence[Ranks]], Figure], name: str, **values: Any
-) -> Iterator[page.Picture]:
+) -> Iterator[str]:
     """Yield figures of a few panels; the first caption explains them all."""
     for at in range(0, len(ranks), MAX_PANELS):
         some = ranks[at : at + MAX_PANELS]
@@ -260,7 +260,7 @@ def _fit_tables(calibration: xr.DataTree, ranks: Mapping[str, Ranks]) -> Iterato
     fits = calibration["fits"].to_dataset()
     answered = np.all([np.isfinite(each.pit) for each in ranks.values()], axis=0)
     tables: dict[str, tuple[type[enum.IntEnum], Mapping[str, str]]] = {
-        "status": (Status, STATUSES),
+        "status": (Status, STATUS_MEANINGS),
         "method": (MethodUsed, text.METHODS_USED),
     }
     for name, (known, meanings) in tables.items():
@@ -268,13 +268,10 @@ def _fit_tables(calibration: xr.DataTree, ranks: Mapping[str, Ranks]) -> Iterato
             continue
         names = " ".join(each.name.lower() for each in known)
         flags = fits[name].assign_attrs({"flag_meanings": names} | fits[name].attrs)
-        counts = {}
-        for value, meaning in flag_meanings(flags).items():
-            chosen = flags.to_numpy() == value
-            if chosen.any():
-                counts[meaning] = [int(chosen.sum()), int(answered[chosen].sum())]
-        data = pd.DataFrame.from_dict(counts, orient="index", columns=["fits", "with ranks"])
-        yield count_table(f"calibration.{name}", data, meanings)
+        known_flags = flag_meanings(flags)
+        found = pd.DataFrame({"fits": 1, "with ranks": answered.astype(int)}, flags.to_numpy())
+        counts = found.groupby(level=0).sum().reindex(list(known_flags)).dropna().astype(int)
+        yield count_table(f"calibration.{name}", counts.rename(known_flags), meanings)
 
 
 def _fit_facts(calibration: xr.DataTree) -> dict[str, str]:
@@ -296,7 +293,7 @@ def _fit_facts(calibration: xr.DataTree) -> dict[str, str]:
     return facts
 
 
-def _provenance_facts(provenance: Provenance) -> Iterator[page.Block]:
+def _provenance_facts(provenance: Provenance) -> Iterator[str]:
     """Return the provenance of the calibration in titled groups of names and values."""
     titles = {
         "truth": "What captures were simulated by, where it differs from what is fitted",
@@ -319,7 +316,7 @@ def _provenance_facts(provenance: Provenance) -> Iterator[page.Block]:
     priors = groups.get(titles["priors"], {})
     groups |= {titles["priors"]: {n: short_numbers(str(x)) for n, x in priors.items()}}
     for title, values in {"Calibration": own, **groups}.items():
-        yield from page.make_facts(values, title)
+        yield page.facts(values, title)
 
 
 REPORT = page.Report(

@@ -1,5 +1,6 @@
 """Report of several fits of one capture: predictive accuracy and differences of intervals."""
 
+import operator
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -15,7 +16,7 @@ from polar_bayes.inference.result import provenance_of
 from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.fit_page import fit_card
 from polar_bayes.reporting.style import BLUE, GRAY, GREEN, ORANGE, PURPLE, SKY, VERMILLION
-from polar_bayes.reporting.text import DASH, column, interval, number, or_dash, percent
+from polar_bayes.reporting.text import DASH, column, digits, ends, or_dash, share
 from polar_bayes.repr_html import Row, Table
 from polar_bayes.scenes.sentences import CLEAR
 
@@ -43,7 +44,7 @@ def plot_comparison(comparison: FitComparison) -> Figure:
         raise FitError(
             "there is nothing to draw", where="plot_comparison", hint="give fits with finite draws"
         )
-    colors = {name: COLORS[at % len(COLORS)] for at, name in enumerate(fits)}
+    colors = style.in_turn(fits, COLORS)
     figure, panels = style.grid(len(labels), panel_height=0.55 + 0.2 * len(fits), header=0.4)
     for axes, label in zip(panels, labels, strict=True):
         for name, row in finite.xs(label, level="parameter").iterrows():
@@ -70,15 +71,15 @@ def comparison_page(fits: Mapping[str, xr.DataTree]) -> page.Page:
     provenances = {name: provenance_of(fit) for name, fit in named.items()}
     verdicts = comparison.verdicts
     failed = {name: verdict for name, verdict in verdicts.items() if not verdict.passed}
-    sensitivity = sensitivity_table(comparison)
     left_out = [f"{name}: {why}." if name else why for name, why in comparison.left_out.items()]
-    predictions: list[page.Block] = [] if comparison.loo.empty else [loo_table(comparison)]
+    loo = None if comparison.loo.empty else loo_table(comparison)
+    predictions = [loo, page.block("bullets", sentences=left_out)]
     more = comparison.parameters.index.get_level_values("parameter").nunique() - style.MAX_PANELS
     note = f" {more} more parameters are in the table only." if more > 0 else ""
     figure = page.picture(plot_comparison(comparison), "comparison.figure_parameters", more=note)
-    prior = [sensitivity] if sensitivity else []
+    prior = [sensitivity_table(comparison)]
     sections = [
-        page.Section("predictions", "Predictions", [*predictions, *page.make_bullets(left_out)]),
+        page.Section("predictions", "Predictions", predictions),
         page.Section("parameters", "Parameters", [figure, parameter_table(comparison)]),
         page.Section("prior", "Prior and data", prior, "Prior and data"),
         page.Section("settings", "What differs", [settings_table(provenances)]),
@@ -101,11 +102,11 @@ def comparison_page(fits: Mapping[str, xr.DataTree]) -> page.Page:
 def loo_table(comparison: FitComparison) -> Table:
     """Return a table of expected log densities, best first."""
     cells: page.Cells = {
-        "elpd": lambda row: f"{row['elpd']:.1f} ± {or_dash(row['se'], '.1f')}",
+        "elpd": text.elpd("se"),
         "difference": text.elpd_difference,
-        "p": lambda row: f"{row['p']:.1f}",
-        "weight": lambda row: f"{row['weight']:.2f}",
-        "k > 0.7": lambda row: f"{int(row['unreliable'])}",
+        "p": column("p", ".1f"),
+        "weight": column("weight", ".2f"),
+        "k > 0.7": column("unreliable", ".0f"),
     }
     return page.make_table("comparison.loo", cells, comparison.loo, label="fit", clear=CLEAR)
 
@@ -114,9 +115,9 @@ def parameter_table(comparison: FitComparison) -> Table:
     """Return a table of every parameter by every fit."""
     cells: page.Cells = {
         "fit": page.second_label,
-        "mean": lambda row: number(row["mean"], row["sd"]),
-        "sd": lambda row: number(row["sd"], row["sd"]),
-        "95% interval": lambda row: interval(row["q2.5"], row["q97.5"], row["sd"]),
+        "mean": digits("mean"),
+        "sd": digits("sd"),
+        "95% interval": ends(scale=operator.itemgetter("sd")),
         "R-hat": column("r_hat", ".3f"),
         "ESS": lambda row: or_dash(np.floor(row["ess_bulk"]), ".0f"),
     }
@@ -130,7 +131,7 @@ def sensitivity_table(comparison: FitComparison) -> Table | None:
         return None
     cells: page.Cells = {
         "fit": page.second_label,
-        "prior inside": lambda row: percent(row["prior_inside"]),
+        "prior inside": share("prior_inside"),
         "by the data": lambda row: str(row["verdict"]),
         **text.SENSITIVITY_CELLS,
     }

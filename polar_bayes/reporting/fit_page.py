@@ -32,14 +32,24 @@ from polar_bayes.diagnostics.view import FitView, Provenance, view_of
 from polar_bayes.errors import FitError, one_line
 from polar_bayes.inference.checks import CAUTION, PROBLEM
 from polar_bayes.inference.files import sentences_of_auto
-from polar_bayes.methods.registry import METHODS
 from polar_bayes.numerics.psis import MAX_PARETO_K
 from polar_bayes.priors import short_numbers
 from polar_bayes.reporting import page, plots_curves, plots_fit, text
 from polar_bayes.reporting.accuracy import accuracy_picture, study_table
 from polar_bayes.reporting.page import Section
 from polar_bayes.reporting.style import QUANTITIES, parameter_title
-from polar_bayes.reporting.text import DASH, column, interval, number, or_dash, percent
+from polar_bayes.reporting.text import (
+    DASH,
+    column,
+    digits,
+    ends,
+    interval,
+    number,
+    or_dash,
+    percent,
+    quarter,
+    share,
+)
 from polar_bayes.repr_html import Row, Table
 from polar_bayes.results import summary, verdict
 from polar_bayes.scenes.sentences import scene_sentences, scene_table
@@ -102,7 +112,7 @@ def fit_page(result: xr.DataTree | FitView) -> page.Page:
         sentences = [*text.determined(fit), *text.between_members(fit)]
     approximation = "Convergence" if fit.method == "nuts" else "Approximation"
     code = str(fit.provenance.get("model_source") or "")
-    source = [page.Details("Source of the model", code=code)] if code else []
+    source = page.block("details", "Source of the model", code=code) if code else ""
     sections = [
         Section("parameters", "Parameters", [parameter_table(fit)]),
         Section("scenes", "Which scene", _scenes(fit.result)),
@@ -123,21 +133,22 @@ def fit_page(result: xr.DataTree | FitView) -> page.Page:
         Section("checks", "Predictive checks", _checks(fit)),
         Section("effects", "Effects", _effects(fit.result)),
         Section("accuracy", "Accuracy against time", _accuracy(fit.result)),
-        Section("provenance", "Provenance", [*provenance_facts(fit.provenance), *source]),
+        Section("provenance", "Provenance", [*provenance_facts(fit.provenance), source]),
     ]
-    method = METHODS[fit.method].label if fit.method in METHODS else one_line(fit.method)
-    swapped = text.swapped_sentence(fit.provenance)
     return page.Page(
         kind="Fit report",
         name=text.capture_name(fit.provenance),
-        subtitles=[text.made_by(fit.provenance, method), *filter(None, [swapped])],
+        subtitles=[
+            text.made_by(fit.provenance, text.method_label(fit.method)),
+            text.swapped_sentence(fit.provenance),
+        ],
         headline=text.fit_headline(fit),
         passed=judged.passed,
         problems=judged.problems,
         answers=tuple(zip(text.QUESTIONS, answers, strict=False)),
         sentences=[*sentences, *text.notes(judged)],
         cautions=judged.cautions,
-        beside=_glance(fit) if plots_curves.variables(fit) else None,
+        beside=_glance(fit) if plots_curves.variables(fit) else "",
         sections=sections,
         footer="Computed from result.nc, which lies in the same folder and holds every draw.",
     )
@@ -175,12 +186,12 @@ def parameter_table(fit: FitView) -> Table:
     if fit.method == "point":
         return _estimate_table(fit)
     cells: page.Cells = {
-        "mean": lambda row: number(row["mean"], row["sd"]),
-        "sd": lambda row: number(row["sd"], row["sd"]),
-        "2.5%": lambda row: number(row["q2.5"], row["sd"]),
-        "97.5%": lambda row: number(row["q97.5"], row["sd"]),
+        "mean": digits("mean"),
+        "sd": digits("sd"),
+        "2.5%": digits("q2.5"),
+        "97.5%": digits("q97.5"),
         TRUTH: _truth_cell,
-        "prior inside": lambda row: percent(row["prior_inside"]),
+        "prior inside": share("prior_inside"),
         "by the data": lambda row: str(row["verdict"]),
     }
     data = convergence.summary(fit).join(sensitivity(fit)[["prior_inside", "verdict"]])
@@ -195,14 +206,11 @@ def _truth_cell(row: pd.Series) -> str:
 
 
 def _estimate_table(fit: FitView) -> Table:
-    def error(row: pd.Series) -> str:
-        size = row["standard_error"]
-        return number(size, size) if math.isfinite(size) else "not determined"
-
+    error = digits("standard_error", "standard_error")
     cells: page.Cells = {
-        "estimate": lambda row: number(row["estimate"], row["standard_error"]),
-        "standard error": error,
-        TRUTH: lambda row: number(row["true_value"], row["standard_error"]),
+        "estimate": digits("estimate", "standard_error"),
+        "standard error": lambda row: error(row).replace(DASH, "not determined"),
+        TRUTH: digits("true_value", "standard_error"),
     }
     data = convergence.summary(fit)[["mean", "sd"]]
     data = data.set_axis(["estimate", "standard_error"], axis="columns")
@@ -212,16 +220,16 @@ def _estimate_table(fit: FitView) -> Table:
 def sensitivity_table(fit: FitView) -> Table:
     """Return a table of prior against posterior, with power-scaling sensitivities."""
     cells: page.Cells = {
-        "prior 95%": lambda row: interval(row["prior_q2.5"], row["prior_q97.5"]),
-        "posterior 95%": lambda row: interval(row["q2.5"], row["q97.5"]),
-        "width left": lambda row: percent(row["width_left"]),
+        "prior 95%": ends("prior_q2.5", "prior_q97.5"),
+        "posterior 95%": ends(),
+        "width left": share("width_left"),
         **text.SENSITIVITY_CELLS,
     }
     options = {"prose": ["remark"], "sensitive": LIMITS.sensitive}
     return fit_table(fit, "fit.sensitivity", cells, sensitivity(fit), **options)
 
 
-def _pairs(fit: FitView) -> Iterator[page.Picture]:
+def _pairs(fit: FitView) -> Iterator[str]:
     if has_draws(fit) and len(plots_fit.drawable(fit, material=True)) > 1:
         yield page.picture(plots_fit.plot_pairs(fit), "fit.figure_pairs")
 
@@ -245,7 +253,7 @@ def _scenes(result: xr.DataTree) -> Iterator[page.Block]:
     cells: page.Cells = {
         "elpd": column("elpd", ".1f"),
         "difference": text.elpd_difference,
-        "weight": lambda row: percent(row["weight"]),
+        "weight": share("weight"),
         **{name: operator.itemgetter(name) for name in texts},
         "criticism": lambda row: row["criticism"] or DASH,
     }
@@ -314,7 +322,7 @@ def _population(fit: FitView) -> list[page.Block]:
         population_table(fit),
         *pictures,
         *([f"{more} more populations are in the table only."] if more > 0 else []),
-        page.Details("Every member in numbers", (member_table(fit),)),
+        page.block("details", "Every member in numbers", items=[member_table(fit)]),
     ]
 
 
@@ -333,7 +341,7 @@ def population_table(fit: FitView) -> Table:
         "members differ by": lambda row: (
             str(row["meaning"]).removeprefix("members differ by ") or DASH
         ),
-        "a new member": lambda row: interval(row["new_q2.5"], row["new_q97.5"]),
+        "a new member": ends("new_q2.5", "new_q97.5"),
         "pooling factor": column("pooling", ".2f"),
     }
     scales = {"log": "the scale of its logarithm", "log odds": "the scale of its log odds"}
@@ -353,15 +361,12 @@ def member_table(fit: FitView) -> Table:
         for scalar in each.members
     }
 
-    def scale(row: pd.Series) -> float:
-        return (row["q97.5"] - row["q2.5"]) / 4.0
-
     cells: page.Cells = {
-        "mean": lambda row: number(row["mean"], scale(row)),
-        "95% interval": lambda row: interval(row["q2.5"], row["q97.5"]),
-        "alone": lambda row: number(row["unpooled"], scale(row)),
-        "95% alone": lambda row: interval(row["unpooled_q2.5"], row["unpooled_q97.5"], scale(row)),
-        "pooled share": lambda row: percent(row["shrinkage"]),
+        "mean": digits("mean", quarter),
+        "95% interval": ends(),
+        "alone": digits("unpooled", quarter),
+        "95% alone": ends("unpooled_q2.5", "unpooled_q97.5", quarter),
+        "pooled share": share("shrinkage"),
     }
     data = shrinkage(fit).loc[list(titles)]
     return page.make_table("fit.member", cells, data, descriptions=titles)
@@ -386,11 +391,12 @@ def _without(fit: FitView) -> Iterator[page.Block]:
         compared = compare_without(fit, key)
         if compared.empty:
             continue
-        yield page.Heading(f"Without {part}")
+        yield page.block("heading", f"Without {part}")
         yield discrepancy_table(fit, compared, part, f"without-{at}")
         yield from text.overconfidence(fit, compared, part)
     for key, reason in (fit.provenance.get("comparisons_failed") or {}).items():
-        yield page.Heading(f"Without {WITHOUT.get(key.removeprefix('without_'), one_line(key))}")
+        part = WITHOUT.get(key.removeprefix("without_"), one_line(key))
+        yield page.block("heading", f"Without {part}")
         yield f"This comparison failed, so nothing is said of it: {one_line(reason)}."
 
 
@@ -398,15 +404,15 @@ def discrepancy_table(fit: FitView, compared: pd.DataFrame, part: str, name: str
     """Return a table of the fit next to a fit without a part of the instrument."""
 
     def scale(row: pd.Series) -> float:
-        return min(row["q97.5"] - row["q2.5"], row["q97.5_without"] - row["q2.5_without"]) / 4.0
+        return min(quarter(row), (row["q97.5_without"] - row["q2.5_without"]) / 4.0)
 
     cells: page.Cells = {
-        "mean": lambda row: number(row["mean"], scale(row)),
-        "95% interval": lambda row: interval(row["q2.5"], row["q97.5"], scale(row)),
-        "mean without": lambda row: number(row["mean_without"], scale(row)),
-        "95% without": lambda row: interval(row["q2.5_without"], row["q97.5_without"], scale(row)),
-        "width": lambda row: percent(row["width_ratio"]),
-        TRUTH: lambda row: number(row["true_value"], scale(row)),
+        "mean": digits("mean", scale),
+        "95% interval": ends(scale=scale),
+        "mean without": digits("mean_without", scale),
+        "95% without": ends("q2.5_without", "q97.5_without", scale),
+        "width": share("width_ratio"),
+        TRUTH: digits("true_value", scale),
     }
     return fit_table(fit, "fit.without", cells, compared, name=name, part=part)
 
@@ -442,14 +448,14 @@ def budget_table(fit: FitView) -> Table:
 # --- Readings and checks --------------------------------------------------------------------------
 
 
-def _glance(fit: FitView) -> page.Picture:
+def _glance(fit: FitView) -> str:
     """Return small figures of readings and fit, which are shown next to the verdict."""
     quantity = QUANTITIES[plots_curves.variables(fit)[0]]
     figure = plots_curves.readings_at_a_glance(fit)
     return page.picture(figure, "fit.figure_glance", quantity=quantity)
 
 
-def _readings(fit: FitView) -> Iterator[page.Picture]:
+def _readings(fit: FitView) -> Iterator[str]:
     key = "fit.figure_readings" if has_draws(fit) else "fit.figure_point_readings"
     for name in plots_curves.variables(fit):
         quantity = QUANTITIES[name]
@@ -481,7 +487,7 @@ def check_table(checks: Mapping[str, PredictiveCheck]) -> Table:
     if any(check.pit.size for check in checks.values()):
         cells |= {f"inside {p:.0%}": _coverage_cell(p) for p in PROBABILITIES}
         cells |= {
-            "elpd": _elpd_cell,
+            "elpd": text.elpd("elpd_error"),
             "p": column("p_loo", ".1f"),
             "k > 0.7": column("unreliable", ".0f"),
         }
@@ -498,12 +504,6 @@ def _check_numbers(check: PredictiveCheck) -> dict[str, float]:
         names = ("elpd", "standard_error", "p_loo", "unreliable")
         numbers |= {name: getattr(check.loo, name, math.nan) for name in names}
     return numbers
-
-
-def _elpd_cell(row: pd.Series) -> str:
-    if not math.isfinite(row["elpd"]):
-        return DASH
-    return f"{row['elpd']:.1f} ± {or_dash(row['elpd_error'], '.1f')}"
 
 
 def _coverage_cell(probability: float) -> Callable[[pd.Series], str]:
@@ -524,8 +524,8 @@ def _convergence(fit: FitView) -> Iterator[page.Block]:
     if fit.method == "nuts":
         yield convergence_table(fit)
     if "auto" in fit.provenance:
-        yield from page.make_bullets(sentences_of_auto(fit.provenance))
-    yield from page.make_facts(_sampler_facts(fit))
+        yield page.block("bullets", sentences=sentences_of_auto(fit.provenance))
+    yield page.facts(_sampler_facts(fit))
     if fit.method == "nuts" and has_draws(fit):
         yield page.picture(plots_fit.plot_ranks(fit), "fit.figure_ranks")
 
@@ -601,7 +601,7 @@ def _accuracy(result: xr.DataTree) -> Iterator[page.Block]:
         yield study_table(study)
 
 
-def provenance_facts(provenance: Provenance) -> list[page.Block]:
+def provenance_facts(provenance: Provenance) -> list[str]:
     """Return the provenance in titled groups; what the user replaced is marked."""
     keys = ["method", "settings", "model", "scene", "scene_parts", "seed", "precision"]
     keys += ["chain_method", "step_size_halvings", "largest_view_zenith"]
@@ -622,14 +622,13 @@ def provenance_facts(provenance: Provenance) -> list[page.Block]:
         "links": set(groups["links"]) if "links" in swapped else set(),
     }
     return [
-        block
-        for name, values in {"fit": fit, **groups}.items()
-        for block in page.make_facts(
+        page.facts(
             values,
             PROVENANCE_GROUPS.get(name, "Fit"),
             marked=marked.get(name, ()),
             mark="replaced",
         )
+        for name, values in {"fit": fit, **groups}.items()
     ]
 
 

@@ -1,7 +1,7 @@
 """Report of a map: status of its pixels, figures, parameters, and coverage where known."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,23 +29,26 @@ from polar_bayes.maps.lazy import (
     shared_parameters,
     start_sentences,
 )
-from polar_bayes.methods.registry import MAP_DEFAULT, METHODS
+from polar_bayes.methods.registry import MAP_DEFAULT
 from polar_bayes.physics.part import notation
 from polar_bayes.reporting import page, style, text
 from polar_bayes.reporting.fit_page import INSTRUMENT_GROUP, provenance_facts
 from polar_bayes.reporting.style import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
-from polar_bayes.reporting.text import DASH, METHODS_USED, SLIGHT, count_percent, number
+from polar_bayes.reporting.text import DASH, METHODS_USED, SLIGHT, count_percent, digits, quarter
 from polar_bayes.repr_html import Row, Table
 
+NO_ANSWER = "#dadada"
 STATUSES = {
-    "good": "an answer that the checks let pass",
-    "masked": "no valid reading",
-    "too few views": f"fewer than {MIN_VIEWS} valid views",
-    "not converged": "no answer was reached; NaN",
-    "not trusted": "numbers that no check confirms, by the method in the next table",
-    "contradicted": "numbers of a good posterior, whose model the readings contradict",
-    "not fitted": "called good without finite numbers, or never written",
+    "good": (BLUE, "an answer that the checks let pass"),
+    "masked": (NO_ANSWER, "no valid reading"),
+    "too few views": (SKY, f"fewer than {MIN_VIEWS} valid views"),
+    "not converged": (VERMILLION, "no answer was reached; NaN"),
+    "not trusted": (ORANGE, "numbers that no check confirms, by the method in the next table"),
+    "contradicted": (GREEN, "numbers of a good posterior, whose model the readings contradict"),
+    "not fitted": (PURPLE, "called good without finite numbers, or never written"),
 }
+"""Color and meaning of each status of a pixel."""
+STATUS_MEANINGS = {status: meaning for status, (_, meaning) in STATUSES.items()}
 CHECKS = {
     "priors": "medians in the tails of their priors",
     "noise": "scatter above its prior, or three times the stated errors",
@@ -55,17 +58,6 @@ CHECKS = {
 }
 
 # --- Figures --------------------------------------------------------------------------------------
-
-NO_ANSWER = "#dadada"
-STATUS_COLORS = {
-    "good": BLUE,
-    "masked": NO_ANSWER,
-    "too few views": SKY,
-    "not converged": VERMILLION,
-    "not trusted": ORANGE,
-    "contradicted": GREEN,
-    "not fitted": PURPLE,
-}
 
 
 @style.styled
@@ -109,7 +101,7 @@ def plot_maps(maps: xr.Dataset, *, wavelength: float | None = None) -> Figure:
     _draw_values(panel(2, 0), shown["pareto_k"], "Pareto k", "magma", limits=(0.0, 1.0))
     _draw_flags(panel(2, 1), shown["method"], (NO_ANSWER, SKY, BLUE, GREEN, ORANGE, PURPLE))
     status = checked_status(shown)
-    colors = [STATUS_COLORS.get(each, NO_ANSWER) for each in flag_meanings(status).values()]
+    colors = [STATUSES.get(each, (NO_ANSWER,))[0] for each in flag_meanings(status).values()]
     _draw_flags(panel(2, 2), status, colors)
     return figure
 
@@ -240,8 +232,7 @@ def map_page(
     maps, provenance = ensure_loaded(maps), provenance_of(maps)
     counts = count_cases(maps)
     headline, passed = text.map_headline(counts)
-    name = str(provenance.get("method", MAP_DEFAULT))
-    method = METHODS[name].label if name in METHODS else one_line(name)
+    method = str(provenance.get("method", MAP_DEFAULT))
     size = " x ".join(f"{maps.sizes[dim]:,}" for dim in IMAGE)
     sentences = [
         *text.pixel_sentences(counts),
@@ -252,41 +243,40 @@ def map_page(
     if truth is not None:
         conclusions, coverage = _coverage(maps, titles, truth, uncorrected)
         sentences += conclusions
-    regions = page.caption("map.regions")
-    tables: list[page.Block] = [parameter_table(maps, titles), regions]
     shared = shared_parameters(maps)
-    if not shared.empty:
-        tables.append(shared_table(shared))
+    tables: list[page.Block | None] = [
+        parameter_table(maps, titles),
+        page.caption("map.regions"),
+        None if shared.empty else shared_table(shared),
+    ]
+    explorer = text.no_explorer()
+    if page.has_explorer():
+        explorer = page.block("link", "The same map to point at, pixel by pixel.", page.EXPLORER)
     sections = [
-        page.Section("maps", "Maps", [_explorer(), *_pictures(maps, list(titles))]),
+        page.Section("maps", "Maps", [explorer, *_pictures(maps, list(titles))]),
         page.Section("pixels", "Pixels", [*_pixel_tables(counts), *_criticism_table(maps)]),
         page.Section("parameters", "Parameters", tables),
         page.Section("coverage", "Coverage", coverage),
         page.Section("provenance", "Provenance", provenance_facts(provenance)),
     ]
-    swapped = text.swapped_sentence(provenance)
     return page.Page(
         kind="Map report",
         name=map_name(maps, truth),
-        subtitles=[f"{size} pixels. {text.made_by(provenance, method)}", *filter(None, [swapped])],
+        subtitles=[
+            f"{size} pixels. {text.made_by(provenance, text.method_label(method))}",
+            text.swapped_sentence(provenance),
+        ],
         headline=headline,
         passed=passed,
         sentences=sentences,
         cautions=[
-            *([page.caption("map.unchecked")] if name == UNCHECKED else []),
+            *([page.caption("map.unchecked")] if method == UNCHECKED else []),
             *shared_cautions(maps),
             *perfect_cautions(maps),
         ],
         sections=sections,
         footer="Computed from the maps of every pixel, which stay where they are.",
     )
-
-
-def _explorer() -> page.Block:
-    """Where the map is that one can point at, or why there is none."""
-    if page.has_explorer():
-        return page.Link("The same map to point at, pixel by pixel.", page.EXPLORER)
-    return text.no_explorer()
 
 
 def _check_uncorrected(maps: xr.Dataset, truth: xr.Dataset | None, uncorrected: xr.Dataset) -> None:
@@ -320,7 +310,7 @@ def parameter_titles(scalars: Sequence[Scalar]) -> dict[Scalar, str]:
     return titles
 
 
-def _pictures(maps: xr.Dataset, scalars: Sequence[Scalar]) -> Iterator[page.Picture]:
+def _pictures(maps: xr.Dataset, scalars: Sequence[Scalar]) -> Iterator[str]:
     """Yield figures of means, widths and diagnostics, a few parameters each."""
     dims = {scalar.name: set(scalar.index) for scalar in scalars}
     names = [name for name in dims if dims[name] <= {"wavelength"}]
@@ -351,7 +341,7 @@ def shown_wavelengths(maps: xr.Dataset) -> list[float]:
 
 def _pixel_tables(counts: pd.DataFrame) -> Iterator[Table]:
     """Return tables of pixels by status, and by method with the share that is good."""
-    yield count_table("map.status", counts.sum(axis=1).to_frame("pixels"), STATUSES)
+    yield count_table("map.status", counts.sum(axis=1).to_frame("pixels"), STATUS_MEANINGS)
     good = counts.loc["good"] if "good" in counts.index else 0 * counts.sum()
     data = pd.DataFrame({"pixels": counts.sum(), "good": good})
     yield count_table("map.method", data, METHODS_USED)
@@ -397,13 +387,9 @@ def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> Table:
         ends = np.quantile(mean, [0.05, 0.95]).tolist() if mean.size else [math.nan] * 2
         data[scalar.label] = [median, *ends, *medians]
     columns = ["median", "5% below", "5% above", "typical sd", "95% width"]
-
-    def cell(column: str) -> Callable[[pd.Series], str]:
-        return lambda row: number(row[column], row["typical sd"])
-
     return page.make_table(
         "map.parameter",
-        {column: cell(column) for column in columns},
+        {column: digits(column, "typical sd") for column in columns},
         pd.DataFrame.from_dict(data, orient="index", columns=columns),
         descriptions={scalar.label: title for scalar, title in titles.items()},
         groups={scalar.label: _group(scalar) for scalar in titles},
@@ -412,15 +398,10 @@ def parameter_table(maps: xr.Dataset, titles: Mapping[Scalar, str]) -> Table:
 
 def shared_table(shared: pd.DataFrame) -> Table:
     """Return a table of the parameters that all pixels share."""
-    width = (shared["q97.5"] - shared["q2.5"]) / 4.0
-
-    def cell(column: str) -> Callable[[pd.Series], str]:
-        return lambda row: number(row[column], width[row.name])
-
     return page.make_table(
         "map.shared",
         {
-            **{column: cell(column) for column in ("q2.5", "q50", "q97.5")},
+            **{column: digits(column, quarter) for column in ("q2.5", "q50", "q97.5")},
             "pixels": text.column("pixels", ",.0f"),
             "disagreement": text.column("disagreement", ".1f"),
         },

@@ -65,7 +65,7 @@ def report_of(result: object) -> Report:
 
 
 type Cells = Mapping[str, Callable[[pd.Series], str]]
-"""Columns of a table: the text of a cell from its row of numbers."""
+"""Columns of a table: the text of a cell from its row of numbers (`polar_bayes.reporting.text`)."""
 
 
 def make_table(
@@ -100,66 +100,29 @@ def second_label(row: pd.Series) -> str:
     return one_line(str(label[1]))
 
 
-# --- Blocks, each drawn by a macro of the template ------------------------------------------------
+# --- Blocks of a page -----------------------------------------------------------------------------
+
+type Block = str | Table
+"""A sentence, a table, or what `block` returns."""
 
 
-class Picture(NamedTuple):
-    """A figure as an image that is embedded in the page."""
-
-    source: str
-    alternative: str
-    caption: str
-    wide: bool
-
-
-class Facts(NamedTuple):
-    """Names, values and marks under an optional title."""
-
-    rows: tuple[tuple[str, str, str], ...]
-    title: str = ""
-
-
-class Heading(NamedTuple):
-    """A heading within a section."""
-
-    text: str
-
-
-class Bullets(NamedTuple):
-    """A list of sentences."""
-
-    sentences: tuple[str, ...]
-
-
-class Link(NamedTuple):
-    """A sentence that leads to another page of the same folder."""
-
-    text: str
-    address: str
-
-
-class Details(NamedTuple):
-    """Blocks or a program that unfold on request."""
-
-    summary: str
-    blocks: "tuple[Block, ...]" = ()
-    code: str = ""
-
-
-type Block = str | Table | Picture | Facts | Heading | Bullets | Link | Details
+def block(macro: str, *texts: str, **values: object) -> str:
+    """Return a macro of `blocks.html.j2`, filled in: a text that is not escaped again."""
+    filled: str = getattr(template("blocks.html.j2").module, macro)(*texts, **values)
+    return filled
 
 
 @dataclasses.dataclass
 class Section:
-    """A section of a page; `link` is its name in the menu. Sections without blocks are omitted."""
+    """A section of a page, and its name in the menu. What is empty is left out."""
 
     id: str
     title: str
-    blocks: Iterable[Block]
+    blocks: Iterable[Block | None]
     link: str = ""
 
     def __post_init__(self) -> None:
-        self.blocks = list(self.blocks)
+        self.blocks = [block for block in self.blocks if block]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,7 +140,7 @@ class Page:
     answers: Sequence[tuple[str, str]] = ()
     sentences: Sequence[str] = ()
     cautions: Sequence[str] = ()
-    beside: Picture | None = None
+    beside: str = ""
 
     @property
     def html(self) -> str:
@@ -217,9 +180,7 @@ def caption(key: str, **values: object) -> str:
     return str(_captions()[kind][name]).format(**values)
 
 
-def picture(
-    figure: Figure, key: str, *, instead: str = "", more: str = "", **values: Any
-) -> Picture:
+def picture(figure: Figure, key: str, *, instead: str = "", more: str = "", **values: Any) -> str:
     """Return a figure as a block of a page, with alternative text and caption."""
     kind, name = key.split(".")
     alternative, caption = (each.format(**values) for each in _captions()[kind][name])
@@ -231,24 +192,18 @@ def picture(
         FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
     encoded = base64.b64encode(buffer.getvalue()).decode("ascii")
     source = f"data:image/svg+xml;base64,{encoded}"
-    return Picture(source, alternative, (instead or caption) + more, figure.get_figwidth() > 7.0)
+    is_wide = figure.get_figwidth() > 7.0
+    return block("picture", source, alternative, (instead or caption) + more, is_wide=is_wide)
 
 
-def make_facts(
+def facts(
     values: Mapping[str, Any], title: str = "", *, marked: Collection[str] = (), mark: str = ""
-) -> list[Block]:
-    """Return names and values as a block, marked names followed by `mark`; None if empty."""
-    rows = tuple(
-        (str(name), _as_text(value), mark if name in marked else "")
-        for name, value in values.items()
-    )
-    return [Facts(rows, title)] if rows else []
-
-
-def make_bullets(sentences: Iterable[str]) -> list[Block]:
-    """Return sentences as a list; None if empty."""
-    found = tuple(sentences)
-    return [Bullets(found)] if found else []
+) -> str:
+    """Return names and values as a block, marked names followed by `mark`; empty without any."""
+    rows = [
+        (name, _as_text(value), mark if name in marked else "") for name, value in values.items()
+    ]
+    return block("facts", rows=rows, title=title)
 
 
 def _as_text(value: object) -> str:

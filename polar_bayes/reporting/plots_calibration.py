@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from polar_bayes.calibration.scores import EcdfBand, ecdf_band, histogram_band, significance_level
 from polar_bayes.calibration.verdict import CalibrationView, calibration_view
 from polar_bayes.diagnostics.coverage import INTERVALS
-from polar_bayes.errors import FitError
 from polar_bayes.reporting import style
 from polar_bayes.reporting.style import BLUE, GRAY, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 from polar_bayes.reporting.text import or_dash
@@ -195,13 +194,7 @@ def plot_calibration(
     """
     ranks = parameter_ranks(calibration)
     shown = list(ranks)[:MAX_ROWS] if parameters is None else list(parameters)
-    unknown = [label for label in shown if label not in ranks]
-    if unknown or not shown:
-        raise FitError(
-            f"there is no parameter {', '.join(unknown)}" if unknown else "nothing is asked for",
-            where="plot_calibration",
-            hint=f"give some of {', '.join(ranks)}",
-        )
+    style.check_shown(shown, ranks, "parameter", "plot_calibration")
     figure, panels = style.grid(3 * len(shown), panel_height=1.7, header=0.3)
     for row, label in enumerate(shown):
         left, middle, right = panels[3 * row : 3 * row + 3]
@@ -222,7 +215,7 @@ def ecdf_differences(
     ranks: Sequence[Ranks], others: Mapping[str, Mapping[str, Ranks]], method: str
 ) -> Figure:
     """Plot the empirical distribution of ranks minus the uniform one."""
-    colors = _method_colors(others)
+    colors = style.in_turn(others, METHOD_COLORS)
 
     def panel(axes: Axes, each: Ranks) -> None:
         same = [(by_label[each.label], colors[name]) for name, by_label in others.items()]
@@ -245,7 +238,7 @@ def interval_coverage(
     ranks: Sequence[Ranks], others: Mapping[str, Mapping[str, Ranks]], method: str
 ) -> Figure:
     """Plot the coverage of 50, 80 and 95% intervals, with a line for each parameter."""
-    colors = _method_colors(others)
+    colors = style.in_turn(others, METHOD_COLORS)
     height = (0.3 + 0.12 * len(others)) * len(ranks) + 1.0
     figure = style.NotebookFigure(figsize=(8.2, height), layout="constrained")
     axes = figure.add_subplot()
@@ -300,10 +293,6 @@ def _panels(
 
 def _title_with_p(ranks: Ranks) -> str:
     return f"{style.wrap(ranks.title, 30)}\np = {or_dash(ranks.row['p_value'], '.2g')}"
-
-
-def _method_colors(others: Mapping[str, object]) -> dict[str, str]:
-    return {name: METHOD_COLORS[at % len(METHOD_COLORS)] for at, name in enumerate(others)}
 
 
 def _name_methods(figure: Figure, method: str, colors: Mapping[str, str]) -> None:

@@ -191,12 +191,8 @@ def _are_priors(value: Any) -> bool:
 def _described_card(result: xr.Dataset) -> DisplaySummary:
     """Return table and sentences of a descriptive result, which has no verdict."""
     found = summary(result)
-    rows = tuple(
-        Row(str(label), tuple(f"{x:.4g}" if isinstance(x, float) else str(x) for x in cells))
-        for label, *cells in found.itertuples()
-    )
-    prose = found.select_dtypes(exclude="number").columns
-    table = Table(("", *found.columns), rows, ("", *prose))
+    prose = ("", *found.select_dtypes(exclude="number").columns)
+    table = Table.of_frame(found, lambda x: f"{x:.4g}" if isinstance(x, float) else str(x), prose)
     return DisplaySummary(
         text.capture_name(provenance_of(result)), tuple(verdict(result).sentences), (table,)
     )

@@ -8,9 +8,10 @@ pyplot.
 
 import functools
 import io
+import itertools
 import math
 import textwrap
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, override
 
 import matplotlib
@@ -26,7 +27,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
 from polar_bayes.diagnostics.parameters import Scalar
-from polar_bayes.errors import one_line
+from polar_bayes.errors import FitError, one_line
 
 # Okabe and Ito, "Color universal design" (2008).
 GRAY = "#6b6b6b"
@@ -154,6 +155,11 @@ def grid(
     return figure, [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
 
 
+def in_turn(names: Iterable[str], looks: Sequence[str]) -> dict[str, str]:
+    """Assign a color or marker to each distinct name; they repeat where there are too few."""
+    return dict(zip(dict.fromkeys(names), itertools.cycle(looks), strict=False))
+
+
 def add_legend(figure: Figure, columns: int, colors: Mapping[str, str] = {}) -> None:
     """A legend above the panels: names by their colors, then each label that was drawn, once."""
     found: list[Artist] = [
@@ -180,6 +186,14 @@ def plain_numbers(*axes: Axis) -> None:
     for axis in axes:
         axis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axis.set_minor_formatter(NullFormatter())
+
+
+def check_shown(shown: Sequence[str], known: Collection[str], what: str, where: str) -> None:
+    """Refuse a figure of nothing, or of what a result does not have."""
+    unknown = ", ".join(name for name in shown if name not in known)
+    if unknown or not shown:
+        missing = f"there is no {what} {unknown}" if unknown else f"there is no {what} to draw"
+        raise FitError(missing, where=where, hint=f"give some of {', '.join(known)}")
 
 
 def padded_range(values: np.ndarray, margin: float) -> tuple[float, float]:

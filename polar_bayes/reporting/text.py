@@ -6,6 +6,7 @@ fits, maps, calibrations and accuracy studies. Tables and captions belong to the
 
 import itertools
 import math
+import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
@@ -86,9 +87,44 @@ def or_dash(value: float, form: str) -> str:
     return format(value, form) if math.isfinite(value) else DASH
 
 
-def column(name: str, form: str) -> Callable[[pd.Series], str]:
-    """Return a function that formats one column of a row, or a dash."""
+type Cell = Callable[[pd.Series], str]
+"""Text of a cell from its row of numbers."""
+
+
+def column(name: str, form: str) -> Cell:
+    """Return a cell: one column of a row, or a dash."""
     return lambda row: or_dash(row[name], form)
+
+
+def share(name: str) -> Cell:
+    """Return a cell: one column in percent."""
+    return lambda row: percent(row[name])
+
+
+def digits(name: str, scale: str | Callable[[pd.Series], float] = "sd") -> Cell:
+    """Return a cell: one column with the digits of another, or of a function of the row."""
+    size = operator.itemgetter(scale) if isinstance(scale, str) else scale
+    return lambda row: number(row[name], size(row))
+
+
+def quarter(row: pd.Series) -> float:
+    """Return a quarter of the width of a 95% interval: about one standard deviation."""
+    return float(row["q97.5"] - row["q2.5"]) / 4.0
+
+
+def ends(
+    name: str = "q2.5",
+    other: str = "q97.5",
+    scale: Callable[[pd.Series], float | None] = lambda row: None,
+) -> Cell:
+    """Return a cell: an interval by the columns of its ends."""
+    return lambda row: interval(row[name], row[other], scale(row))
+
+
+def elpd(error: str) -> Cell:
+    """Return a cell: an expected log density with its standard error, which is another column."""
+    form = column(error, ".1f")
+    return lambda row: f"{row['elpd']:.1f} ± {form(row)}" if math.isfinite(row["elpd"]) else DASH
 
 
 def elpd_difference(row: pd.Series) -> str:
@@ -98,20 +134,17 @@ def elpd_difference(row: pd.Series) -> str:
     return " ± ".join(numbers([row["elpd_diff"], row["dse"]], max(row["dse"], 0.2)))
 
 
-SENSITIVITY_CELLS: Mapping[str, Callable[[pd.Series], str]] = {
+SENSITIVITY_CELLS: Mapping[str, Cell] = {
     "to the priors": column("prior_sensitivity", ".3f"),
     "to the data": column("likelihood_sensitivity", ".3f"),
     "remark": lambda row: str(row["remark"]),
 }
 
 
-def p_value(level: float) -> Callable[[pd.Series], str]:
-    """Return a function that formats p-values, marked where the test fails at a level."""
-
-    def cell(row: pd.Series) -> str:
-        return or_dash(row["p_value"], ".2g") + (" (fails)" if row["p_value"] < level else "")
-
-    return cell
+def p_value(level: float) -> Cell:
+    """Return a cell: a p-value, marked where the test fails at a level."""
+    p = column("p_value", ".2g")
+    return lambda row: p(row) + (" (fails)" if row["p_value"] < level else "")
 
 
 def join_first(names: Sequence[str]) -> str:
@@ -149,6 +182,11 @@ def fit_headline(fit: FitView) -> str:
         against = "but the readings speak against the model: do not use these intervals."
         return f"{name} {passed}, {against}"
     return f"{name} {passed}." + (" Mind the cautions." if verdict.cautions else "")
+
+
+def method_label(method: str) -> str:
+    """Return the name of a method for readers."""
+    return METHODS[method].label if method in METHODS else one_line(method)
 
 
 def made_by(provenance: Provenance, method: str) -> str:

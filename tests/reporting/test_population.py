@@ -1,5 +1,7 @@
 """Shrinkage plots, and what the page says about populations and about what was swapped."""
 
+import re
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -162,10 +164,12 @@ def test_provenance_marks_what_was_swapped() -> None:
         "fixed": {"refractive_index": 1.45},
         "swapped": ["model", "prior of roughness", "refractive_index held fixed"],
     }
-    groups = {facts.title: facts.rows for facts in provenance_facts(provenance)}
+    row = r"<dt>(.*?)</dt><dd>(.*?)(?: <mark>(.*?)</mark>)?</dd>"
+    blocks = [facts.partition("</h3>") for facts in provenance_facts(provenance) if facts]
+    groups = {title.removeprefix("<h3>"): re.findall(row, rows) for title, _, rows in blocks}
     marked = {name for rows in groups.values() for name, _, mark in rows if mark == "replaced"}
     assert marked == {"model", "roughness"}
-    assert groups["Priors that stand in the model itself"] == (("tilt", "Normal", ""),)
-    assert groups["Held fixed, by the model or around it"] == (("refractive_index", "1.45", ""),)
+    assert groups["Priors that stand in the model itself"] == [("tilt", "Normal", "")]
+    assert groups["Held fixed, by the model or around it"] == [("refractive_index", "1.45", "")]
     values = [value for _, value, _ in groups["Settings of the model"]]
     assert values == ["roughness", "kernel matern52"]
