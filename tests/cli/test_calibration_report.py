@@ -27,20 +27,3 @@ def test_a_calibration_has_a_page(files: Path, capsys: pytest.CaptureFixture[str
     assert "Calibration report: leaf" in page.read_text()
     assert main([*words, "--compare", str(files / "laplace.nc")]) == 0
     assert "by laplace intervals are too narrow" in page.read_text()
-
-
-def test_a_mistake_gets_one_line(files, capsys, monkeypatch) -> None:
-    monkeypatch.chdir(files)
-    (files / "other").mkdir()
-    pb.save(make_calibration(count=60), files / "other" / "laplace.nc")
-    twice = ["--compare", "laplace.nc", "--compare", "other/laplace.nc"]
-    for options, says in (
-        (["nowhere.nc"], "nowhere.nc: there is no such file"),
-        (["sbc.nc", "--compare", "nowhere.nc"], "nowhere.nc: there is no such file"),
-        (["sbc.nc", *twice], "two of the files have the same name"),
-    ):
-        assert main(["report", *options, "--out", "report"]) == 1
-        told = capsys.readouterr()
-        assert says in told.err
-        assert told.err.count("\n") == 1
-    assert not (files / "report").exists()

@@ -236,31 +236,6 @@ def test_the_scatter_of_repeats_is_the_error(tmp_path):
     assert (stated["q_error"] > averaged["q_error"]).all()
 
 
-GUESSES = {
-    "two_theta": ("two_theta", "line 12: the angle is outside", "--angle-is two-theta"),
-    "deviation": ("deviation", "line 2: the angle is outside", "--angle-is deviation"),
-    "negative_angles": ("angle", "line 2: the angle is outside", "--angle-is incidence takes the"),
-    "from_surface": ("angle", "an index of 0.69, below that of vacuum", "--angle-is from-surface"),
-}
-
-
-@each("name", GUESSES)
-def test_another_scale_of_the_angle_is_guessed_at_its_first_wrong_line(name, tmp_path, capsys):
-    column, what, guess = GUESSES[name]
-    words = ("--angle", column, *COLUMNS[2:])
-    assert read(CASES / f"{name}.csv", GONIOMETER, words, tmp_path / "x.nc") == 1
-    told = capsys.readouterr().err
-    assert what in told
-    assert guess in told
-    assert told.count("\n") == 1
-
-
-def test_mueller_elements_in_a_list_are_refused_by_the_command_that_takes_them(tmp_path, capsys):
-    assert read(CASES / "mueller.csv", TABLE, ("--angle", "AOI"), tmp_path / "x.nc") == 1
-    told = capsys.readouterr().err
-    assert "it holds elements of Mueller matrices; import it by polar-bayes import ellips" in told
-
-
 # Further kinds: the readings of the clean plate, as other programs write them.
 
 ROWS = [line.split(",") for line in (CASES / "clean_plate.csv").read_text().splitlines()[1:]]

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from cases import each
 from plate_images import plate_image
 from synthetic_maps import make_maps
 
@@ -50,24 +49,6 @@ def test_a_map_has_a_page(
     assert "uncorrected" in page.read_text()
 
 
-@each(
-    ("options", "says"),
-    [
-        (["nowhere.zarr"], "nowhere.zarr: there is no such store"),
-        (["map.zarr", "--uncorrected", "bare.zarr"], "give --truth as well"),
-        (["map.zarr", "--truth", "nowhere.nc"], "nowhere.nc: there is no such file"),
-        (["map.zarr", "--truth", "leaf.zarr", "--uncorrected", "map.zarr"], "corrected as well"),
-    ],
-)
-def test_a_mistake_gets_one_line(files, options, says, capsys, monkeypatch) -> None:
-    monkeypatch.chdir(files)
-    assert main(["report", *options, "--out", "report"]) == 1
-    told = capsys.readouterr()
-    assert says in told.err
-    assert told.err.count("\n") == 1
-    assert not (files / "report").exists()
-
-
 def test_a_finished_map_is_resumed_with_status_0(tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.setattr(store, "fit_block", lambda block, plan: blank(block, plan).load())
     capture, out = tmp_path / "plates.zarr", tmp_path / "map.zarr"
@@ -83,14 +64,7 @@ def test_a_finished_map_is_resumed_with_status_0(tmp_path, capsys, monkeypatch) 
     assert "it was begun with another capture or other settings" in capsys.readouterr().err
 
 
-def test_what_an_image_shares_is_told_with_its_interval(tmp_path, capsys) -> None:
-    plate_image(3, 4).to_zarr(tmp_path / "plates.zarr", consolidated=False)
-    words = ["map", str(tmp_path / "plates.zarr"), "--out", str(tmp_path / "map.zarr")]
-    assert main([*words, "--scene", "goniometer", "--share", "roughness"]) == 1
-    told = capsys.readouterr().err
-    assert "map: --share roughness: an image cannot share it; give names among" in told
-    assert "stokes_error_factor" in told
-    assert not (tmp_path / "map.zarr").exists()
+def test_what_an_image_shares_is_told_with_its_interval(tmp_path) -> None:
     shared = {
         "stokes_error_factor": {
             "quantiles": {"0.025": 0.9, "0.5": 1.0, "0.975": 1.1},

@@ -5,10 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from cases import each
-from PIL import Image
 from synthetic_results import make_result
 
 import polar_bayes as pb
@@ -20,59 +18,6 @@ ROOT = Path(__file__).parents[2]
 
 def digest(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()
-
-
-@pytest.fixture
-def inputs(plate: Path, tmp_path: Path) -> Path:
-    """A folder with an input of every kind."""
-    (tmp_path / "x.nc").write_bytes(plate.read_bytes())
-    (tmp_path / "y.nc").write_bytes(plate.read_bytes())
-    (tmp_path / "t.csv").write_text("angle,s,p\n" + "".join(f"{a},3,2\n" for a in range(20, 60, 5)))
-    for angle in (0, 45, 90):
-        Image.fromarray(np.full((4, 4), 10 + angle, np.uint8)).save(tmp_path / f"g{angle}.png")
-    return tmp_path
-
-
-COLUMNS = ("--angle", "angle", "--s", "s", "--p", "p")
-FRAMES = ("--frame", "0", "g0.png", "--frame", "45", "g45.png", "--frame", "90", "g90.png")
-PLACE = ("--sphere", "2", "2", "2", "--light", "0", "0", "1")
-DESTROYING = {
-    "table": ("import", "goniometer", "--table", "t.csv", *COLUMNS, "--out", "t.csv"),
-    "two tables": ("import", "goniometer", "--s", "t.csv", "--p", "t.csv", "--out", "t.csv"),
-    "list": ("import", "table", "t.csv", "--out", "./t.csv"),
-    "frame": ("import", "polarizer", *FRAMES, *PLACE, "--out", "g0.png"),
-    "mosaic": ("import", "mosaic", "g0.png", *PLACE, "--out", "g0.png"),
-    "flat": ("import", "mosaic", "g0.png", *PLACE, "--flat", "g45.png", "--out", "g45.png"),
-    "fit": ("fit", "x.nc", "--out", "x.nc"),
-    "effects": ("effects", "x.nc", "--out", "x.nc"),
-    "map": ("map", "x.nc", "--out", "x.nc"),
-    "calibrate": ("calibrate", "x.nc", "--out", "x.nc"),
-    "accuracy": ("accuracy", "x.nc", "--out", "x.nc"),
-    "combine": ("combine", "x.nc", "y.nc", "--out", "y.nc"),
-    "report": ("report", "x.nc", "--out", "x.nc"),
-    "compare": ("compare", "x.nc", "y.nc", "--out", "y.nc"),
-}
-
-
-@each("command", DESTROYING)
-def test_no_command_writes_over_its_input(command, inputs, monkeypatch, capsys):
-    monkeypatch.chdir(inputs)
-    before = {file.name: digest(file) for file in inputs.iterdir()}
-    assert main(list(DESTROYING[command])) == 1
-    told = capsys.readouterr()
-    assert "it is one of the inputs; give another path to write" in told.err
-    assert told.err.count("\n") == 1
-    assert {file.name: digest(file) for file in inputs.iterdir()} == before
-
-
-@each("words", [("fit", "x.nc"), ("calibrate", "x.nc"), ("accuracy", "x.nc")])
-@each("other", ["y.nc", "t.csv", "g0.png"])
-def test_a_result_takes_the_place_of_no_other_file(words, other, inputs, monkeypatch, capsys):
-    monkeypatch.chdir(inputs)
-    before = digest(inputs / other)
-    assert main([*words, "--out", other]) == 1
-    assert f"{other}: the file there holds something else" in capsys.readouterr().err
-    assert digest(inputs / other) == before
 
 
 @each("words", [("simulate",), ("fit", "x.nc"), ("map", "x.nc"), ("report", "x.nc"), ("demo",)])

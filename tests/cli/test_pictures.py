@@ -5,9 +5,7 @@ from pathlib import Path
 import numpy as np
 import pictures
 import pytest
-from cases import each
 from pictures import BALL, LAMP
-from PIL import Image
 
 import polar_bayes as pb
 from polar_bayes.cli import main
@@ -99,35 +97,3 @@ def rim() -> np.ndarray:
     around = np.linspace(0.0, 6.0, 9)
     row = BALL.row + BALL.radius * np.sin(around)
     return np.stack([row, BALL.column + BALL.radius * np.cos(around)], axis=-1)
-
-
-@each(
-    ("words", "said"),
-    [
-        ([*LIGHT], "give one of --sphere or --rim, --normals"),
-        ([*SPHERE], "give one of --light, --light-position, --highlight, --surroundings"),
-        ([*SPHERE, *LIGHT, "--surroundings"], "give one of --light"),
-        ([*SPHERE, *LIGHT, "--dark", __file__, "--dark-level", "3"], "exclude each other"),
-        ([*SPHERE, *LIGHT], "--saturation-level: the frames do not say"),
-        ([*SPHERE, *LIGHT, *FULL, "--dark", "none.npy"], "none.npy: there is no such file"),
-        ([*SPHERE, "--highlight", "0", "0", *FULL], "there is no surface"),
-        ([*SPHERE, *LIGHT, *FULL, "--transfer", "rec709"], "transfer: it is 'rec709'"),
-        ([*SPHERE, *LIGHT, *FULL, "--dark", "curved.png"], "undo it by --transfer srgb or"),
-    ],
-)
-def test_a_mistake_takes_one_line_and_writes_nothing(
-    files: list[str],
-    words: list[str],
-    said: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    out = tmp_path / "ball.nc"
-    monkeypatch.chdir(tmp_path)
-    Image.new("L", (48, 40)).save("curved.png", icc_profile=b"a tone curve")
-    assert main(["import", "polarizer", *files, *words, "--out", str(out)]) == 1
-    error = capsys.readouterr().err
-    assert said in error
-    assert error.count("\n") == 1
-    assert not out.exists()
