@@ -16,12 +16,10 @@ from selenium.webdriver.common.by import By
 from synthetic_accuracy import make_accuracy
 from synthetic_calibrations import make_calibration
 from synthetic_maps import make_maps
-from synthetic_results import edit_provenance, make_result, pool
+from synthetic_results import SMALL, edit_provenance, make_result, pool
 
 import polar_bayes as pb
 from polar_bayes.diagnostics.convergence import summary
-
-SMALL = {"wavelengths": (), "views": 10, "draws": 120, "variables": ("dop",)}
 
 
 def evil_fit():

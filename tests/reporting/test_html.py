@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 from cases import each
 from pages import Page
-from synthetic_results import edit_provenance, make_result
+from synthetic_results import SMALL, edit_provenance, make_result
 
 import polar_bayes as pb
 from polar_bayes.diagnostics import convergence, criticism
@@ -25,8 +25,6 @@ from polar_bayes.reporting.report import render, report
 from polar_bayes.reporting.text import QUESTIONS, interval, join, numbers, overconfidence, percent
 
 pytestmark = pytest.mark.usefixtures("unpainted")
-
-SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from pages import EVIL, Page, blank_pictures, faults_of
 from synthetic_accuracy import make_accuracy
 from synthetic_calibrations import NAMES, make_calibration
 from synthetic_maps import make_maps
-from synthetic_results import edit_provenance, make_result, pool, replace
+from synthetic_results import SMALL, edit_provenance, make_result, moved, pool, with_law, worse
 
 import polar_bayes as pb
 from polar_bayes.inference.batching import MethodUsed, Status
@@ -30,28 +30,12 @@ from polar_bayes.reporting.report import render
 pytestmark = pytest.mark.usefixtures("unpainted")
 
 APPROVED = Path(__file__).with_name("approved")
-SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
 SHAPE = (10, 20)
 MEANS = {
     "roughness": np.full(SHAPE, 0.5),
     "subsurface_fraction": np.linspace(0.2, 0.4, 200).reshape(SHAPE),
     "concentration_scale": np.full(SHAPE, 300.0),
 }
-
-
-def moved(by: float, chains: slice = slice(1), **asked: object) -> xr.DataTree:
-    """A result some of whose chains are elsewhere in roughness."""
-    result = make_result(**SMALL, **asked)
-    draws = result["posterior"].to_dataset()["roughness"].to_numpy().copy()
-    draws[chains] += by
-    return replace(result, "posterior", "roughness", draws)
-
-
-def worse(by: float) -> xr.DataTree:
-    """A result that predicts its readings worse."""
-    result = make_result(**SMALL)
-    density = result["log_likelihood"].to_dataset()["dop"]
-    return replace(result, "log_likelihood", "dop", density - by * (1 + density["view"] % 3))
 
 
 def populations(**asked: object) -> xr.DataTree:
@@ -63,21 +47,10 @@ def populations(**asked: object) -> xr.DataTree:
 
 def colored() -> xr.DataTree:
     """An index by Cauchy's law, and a model of the user's own."""
-    result = make_result(views=6, draws=60, variables=("dop",))
-    posterior, rng = result["posterior"].to_dataset(), np.random.default_rng(5)
-    a, b = (
-        (("chain", "draw"), x + s * rng.standard_normal((4, 60)))
-        for x, s in ((1.45, 0.01), (0.005, 0.001))
-    )
-    posterior = posterior.assign(cauchy_a=a, cauchy_b=b)
-    index = posterior["cauchy_a"] + posterior["cauchy_b"] / (posterior["wavelength"] / 1e3) ** 2
-    posterior["refractive_index"] = index.transpose("chain", "draw", "wavelength")
-    result["posterior"] = xr.DataTree(posterior)
-    scene = pb.Scene(surface=pb.SmoothSurface(), dispersion=pb.physics.Cauchy())
     source = f"def story(data):\n    # {EVIL}\n    return 1 < 2\n"
     swapped = ["scene", "model", *(f"prior of p{i}" for i in range(8)), f"{EVIL} held fixed"]
-    own = {"scene": "custom", "scene_parts": repr(scene), "model_source": source}
-    return edit_provenance(result, **own, model="story", swapped=swapped, fixed={EVIL: 1.45})
+    own = {"model": "story", "model_source": source, "swapped": swapped}
+    return edit_provenance(with_law(), **own, fixed={EVIL: 1.45})
 
 
 def odd() -> xr.DataTree:

@@ -4,14 +4,12 @@ import numpy as np
 import pytest
 from pages import EVIL, Page
 from plates import plate_capture
-from synthetic_results import make_result, replace
+from synthetic_results import SMALL, make_result, moved
 
 import polar_bayes as pb
 from polar_bayes.errors import FitError
 
 pytestmark = pytest.mark.usefixtures("unpainted")
-
-SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
 
 
 def test_the_verdict_comes_before_the_numbers() -> None:
@@ -22,10 +20,7 @@ def test_the_verdict_comes_before_the_numbers() -> None:
 
 @pytest.mark.thorough
 def test_a_failed_fit_says_so_and_claims_nothing() -> None:
-    result = make_result(**SMALL)
-    draws = result["posterior"].to_dataset()["roughness"].to_numpy().copy()
-    draws[0] += 1.0
-    card = pb.show(replace(result, "posterior", "roughness", draws))
+    card = pb.show(moved(1.0))
     assert "do not use these numbers" in repr(card)
     assert "The data determine" not in repr(card)
     assert 'class="pb-card bad"' in card._repr_html_()
