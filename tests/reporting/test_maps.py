@@ -45,7 +45,7 @@ def test_a_pixel_without_numbers_is_not_drawn_as_good() -> None:
     status = next(axes for axes in panel if axes.get_title("left") == "status")
     drawn = np.asarray(status.images[0].get_array())
     assert set(zip(*np.nonzero(drawn), strict=True)) == {(0, 0), (3, 4)}  # the first has no mean
-    assert drawn[0, 0] == drawn[3, 4] == len(Status)
+    assert drawn[0, 0] == drawn[3, 4] == list(Status).index(Status.NOT_FITTED)
 
 
 @pytest.mark.thorough
