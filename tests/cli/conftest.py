@@ -61,8 +61,9 @@ def inputs(plate: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         Image.fromarray(np.full((4, 4), 10 + angle, np.uint8)).save(folder / f"g{angle}.png")
     (folder / "other").mkdir()
     pb.save(make_calibration(count=60), folder / "sbc.nc")
-    for name in ("laplace.nc", "other/laplace.nc"):
-        shutil.copy(folder / "sbc.nc", folder / name)
+    narrow = make_calibration(count=60, narrow={"roughness": 0.4}, method="laplace")
+    pb.save(narrow, folder / "laplace.nc")
+    shutil.copy(folder / "laplace.nc", folder / "other")
     mean = {"roughness": np.full((4, 5), 0.5)}
     truth = xr.Dataset({"true_roughness": 0.5}, attrs={"name": "leaf"})
     bare = make_maps(mean, method="laplace")

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import xarray as xr
 from plate_images import plate_image
 from synthetic_maps import make_maps
 
@@ -18,23 +17,10 @@ from polar_bayes.reporting.page import INSTALL
 pytestmark = pytest.mark.usefixtures("unpainted")
 
 
-@pytest.fixture
-def files(tmp_path: Path) -> Path:
-    mean = {"roughness": np.full((4, 5), 0.5)}
-    make_maps(mean).to_zarr(tmp_path / "map.zarr", consolidated=False)
-    make_maps(mean, method="laplace").to_zarr(tmp_path / "bare.zarr", consolidated=False)
-    truth = xr.Dataset({"true_roughness": 0.5}, attrs={"name": "leaf"})
-    truth.to_zarr(tmp_path / "leaf.zarr", consolidated=False)
-    return tmp_path
-
-
-def test_a_map_has_a_page(
-    files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    words = ["report", str(files / "map.zarr"), "--out", str(files / "report")]
+def test_a_map_has_a_page(inputs: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+    words = ["report", str(inputs / "map.zarr"), "--out", str(tmp_path)]
     assert main(words) == 0
-    page = files / "report" / "index.html"
-    explorer = files / "report" / "explore.html"
+    page, explorer = tmp_path / "index.html", tmp_path / "explore.html"
     assert capsys.readouterr().out == f"report: {page}\nmap to point at: {explorer}\n"
     assert "The page was made without the capture" in explorer.read_text()
     with monkeypatch.context() as without:
@@ -43,7 +29,7 @@ def test_a_map_has_a_page(
     told = capsys.readouterr().out.splitlines()[1]
     assert told == f"There is no map to point at, because Bokeh is not installed: {INSTALL}."
     assert "Map report: map" in page.read_text()
-    words += ["--truth", str(files / "leaf.zarr"), "--uncorrected", str(files / "bare.zarr")]
+    words += ["--truth", str(inputs / "leaf.zarr"), "--uncorrected", str(inputs / "bare.zarr")]
     assert main(words) == 0
     assert "Map report: leaf" in page.read_text()
     assert "uncorrected" in page.read_text()

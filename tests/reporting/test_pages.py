@@ -217,7 +217,7 @@ CARDS: dict[str, Callable[[], object]] = {
     "fit": lambda: make_result(**SMALL),
     "failed fit": lambda: moved(1.0),
     "thirty materials": lambda: make_result(
-        **SMALL | {"views": 4}, materials=tuple(map(str, range(30)))
+        **SMALL | {"views": 4, "draws": 30}, materials=tuple(map(str, range(30)))
     ),
     "capture": lambda: plate_capture(np.linspace(20.0, 70.0, 5), 0.02, seed=1).drop_attrs(
         deep=False
