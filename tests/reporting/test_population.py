@@ -60,7 +60,7 @@ def test_a_member_that_says_nothing_alone_is_drawn_as_such() -> None:
     assert np.isnan(shrinkage(result)["unpooled"].iloc[2])
     figure = plot_shrinkage(result, "refractive_index")
     said = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert "alone: undetermined" in said
+    assert "alone it says nothing" in said
 
 
 @pytest.mark.thorough
