@@ -19,6 +19,9 @@ SHAPE = (40, 48)
 BALL = pb.importers.Sphere(19.3, 23.8, 17.5)  # no pixel faces the camera exactly
 LAMP = pb.importers.Direction(0.4, 0.7, 0.8)
 FULL = 1000.0
+FOUR = (0.0, 45.0, 90.0, 135.0)
+QUIET = pb.importers.Detector(saturation_level=FULL, gain=1e-6, read_noise=0.0, relative_error=0.0)
+"""A detector without noise."""
 
 
 def ball_normals(shape=SHAPE, ball=BALL):
@@ -119,3 +122,25 @@ def frames(angles, *, normals=None, view=None, light=None, full=FULL, **asked):
     passed = np.stack([behind_polarizer(matrix, angle, view) for angle in angles])
     # Half of full scale for the brightest place.
     return np.nan_to_num(passed * 0.5 * full / np.nanmax(passed))
+
+
+def predicted(capture, where=...):
+    """Readings of the scene at the capture's own directions, in the pixels of a mask."""
+    names = ("view_zenith", "view_azimuth", "light_zenith", "light_azimuth")
+    geometry = pb.Geometry.from_degrees(**{name: capture[name].values for name in names})
+    said = SCENE.predict(TRUTH, geometry)
+    return {name: np.asarray(values)[where] for name, values in said.items()}
+
+
+def even(normal, shape=SHAPE):
+    """One normal for all pixels."""
+    return np.broadcast_to(unit(np.asarray(normal, float)), (*shape, 3))
+
+
+def mosaic(frames, layout=((90.0, 45.0), (135.0, 0.0))):
+    """The mosaic of four frames, each pixel behind its own polarizer."""
+    found = np.zeros(frames[0].shape)
+    for row, column in np.ndindex(2, 2):
+        frame = frames[FOUR.index(layout[row][column])]
+        found[row::2, column::2] = frame[row::2, column::2]
+    return found

@@ -10,6 +10,8 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
+import polar_bayes as pb
+
 PRIOR = {
     "roughness": (0.2, 0.05),
     "subsurface_fraction": (0.5, 0.15),
@@ -20,6 +22,8 @@ PRIOR = {
 SPECTRAL = ("absorption", "refractive_index")
 SCALE = {"dop": 0.01, "q": 0.01, "intensity": 0.02}
 FULL_SCALE = 1.0
+SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
+"""A layout that is quick to summarize."""
 
 
 def make_result(
@@ -137,6 +141,35 @@ def replace(tree, group, name, values):
     dataset[name] = (dataset[name].dims, np.asarray(values), dataset[name].attrs)
     tree[group] = xr.DataTree(dataset)
     return tree
+
+
+def moved(by, chains=slice(1), **asked):
+    """A result some of whose chains are elsewhere in roughness."""
+    result = make_result(**SMALL, **asked)
+    draws = result["posterior"].to_dataset()["roughness"].to_numpy().copy()
+    draws[chains] += by
+    return replace(result, "posterior", "roughness", draws)
+
+
+def worse(by, **asked):
+    """A result that predicts its readings worse."""
+    result = make_result(**SMALL | asked)
+    density = result["log_likelihood"].to_dataset()["dop"]
+    return replace(result, "log_likelihood", "dop", density - by * (1 + density["view"] % 3))
+
+
+def with_law(**asked):
+    """A result whose index follows Cauchy's law, with the coefficients of every draw."""
+    result = make_result(**{"views": 6, "draws": 60, "variables": ("dop",)} | asked)
+    posterior, rng = result["posterior"].to_dataset(), np.random.default_rng(5)
+    grid = (posterior.sizes["chain"], posterior.sizes["draw"])
+    for name, center, sd in (("cauchy_a", 1.45, 0.01), ("cauchy_b", 0.005, 0.001)):
+        posterior[name] = (("chain", "draw"), center + sd * rng.standard_normal(grid))
+    index = posterior["cauchy_a"] + posterior["cauchy_b"] / (posterior["wavelength"] / 1e3) ** 2
+    posterior["refractive_index"] = index.transpose("chain", "draw", "wavelength")
+    result["posterior"] = xr.DataTree(posterior)
+    scene = pb.Scene(surface=pb.SmoothSurface(), dispersion=pb.physics.Cauchy())
+    return edit_provenance(result, scene="custom", scene_parts=repr(scene))
 
 
 def _parameters(lead):

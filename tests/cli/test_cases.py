@@ -12,10 +12,12 @@ import openpyxl
 import pytest
 import xarray as xr
 from cases import each
+from synthetic_results import SMALL, make_result
 
 import polar_bayes as pb
 from polar_bayes.capture.plausibility import fresnel
 from polar_bayes.cli import main
+from polar_bayes.priors import support_bounds
 
 CASES = Path(__file__).parents[1] / "cases"
 pytestmark = pytest.mark.usefixtures("without_comparisons")
@@ -71,6 +73,21 @@ def test_an_index_beyond_the_prior_is_one_sentence_at_import(name, tmp_path, cap
     )
 
 
+@each("name", BEYOND)
+def test_the_option_that_the_sentence_names_allows_the_index(name, tmp_path, monkeypatch):
+    _, option, index = BEYOND[name]
+    asked: dict[str, dict] = {}
+
+    def fit(capture, **settings):
+        asked.update(settings)
+        return make_result(**SMALL)
+
+    monkeypatch.setattr(pb, "fit", fit)
+    fitted(imported(name, tmp_path), *option.replace("'", "").split(" ", 1))
+    low, high = support_bounds(asked["priors"]["refractive_index"])
+    assert low < index < high
+
+
 @each("name", ["clean_plate", "slide_back_0"])
 def test_an_index_that_the_prior_allows_is_none(name, tmp_path, capsys):
     imported(name, tmp_path)
@@ -94,6 +111,7 @@ def test_a_fit_says_that_its_prior_excludes_the_index(name, tmp_path, capsys):
     assert "priors={'refractive_index': TruncatedNormal(" in row["sentence"]
 
 
+@pytest.mark.thorough
 def test_the_option_that_the_sentence_names_mends_the_fit(tmp_path, capsys):
     capture = imported("high_index", tmp_path)
     _, option, index = BEYOND["high_index"]
@@ -234,31 +252,6 @@ def test_the_scatter_of_repeats_is_the_error(tmp_path):
     stated = pb.from_goniometer("Is", "Ip", table=scans, angle="angle", relative_error=0.02)
     assert stated.attrs["relative_error"] == 0.02
     assert (stated["q_error"] > averaged["q_error"]).all()
-
-
-GUESSES = {
-    "two_theta": ("two_theta", "line 12: the angle is outside", "--angle-is two-theta"),
-    "deviation": ("deviation", "line 2: the angle is outside", "--angle-is deviation"),
-    "negative_angles": ("angle", "line 2: the angle is outside", "--angle-is incidence takes the"),
-    "from_surface": ("angle", "an index of 0.69, below that of vacuum", "--angle-is from-surface"),
-}
-
-
-@each("name", GUESSES)
-def test_another_scale_of_the_angle_is_guessed_at_its_first_wrong_line(name, tmp_path, capsys):
-    column, what, guess = GUESSES[name]
-    words = ("--angle", column, *COLUMNS[2:])
-    assert read(CASES / f"{name}.csv", GONIOMETER, words, tmp_path / "x.nc") == 1
-    told = capsys.readouterr().err
-    assert what in told
-    assert guess in told
-    assert told.count("\n") == 1
-
-
-def test_mueller_elements_in_a_list_are_refused_by_the_command_that_takes_them(tmp_path, capsys):
-    assert read(CASES / "mueller.csv", TABLE, ("--angle", "AOI"), tmp_path / "x.nc") == 1
-    told = capsys.readouterr().err
-    assert "it holds elements of Mueller matrices; import it by polar-bayes import ellips" in told
 
 
 # Further kinds: the readings of the clean plate, as other programs write them.

@@ -81,11 +81,5 @@ def test_identify_follows_a_profile(plate: Path, capsys: pytest.CaptureFixture[s
     )
 
 
-def test_a_standard_uncertainty_that_is_no_number_is_named(plate, capsys) -> None:
-    assert main(["budget", str(plate), "--known", "tone_curve=0.1", "--known", "lamp=far"]) == 1
-    said = capsys.readouterr().err
-    assert said == "--known lamp=far: it is no number; write it as --known light_zenith=0.2\n"
-
-
 def test_options_offer_every_scale_of_the_angle() -> None:
     assert tuple(ANGLE_IS) == SCALES

@@ -5,8 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import xarray as xr
-from cases import each
 from plate_images import plate_image
 from synthetic_maps import make_maps
 
@@ -19,23 +17,10 @@ from polar_bayes.reporting.page import INSTALL
 pytestmark = pytest.mark.usefixtures("unpainted")
 
 
-@pytest.fixture
-def files(tmp_path: Path) -> Path:
-    mean = {"roughness": np.full((4, 5), 0.5)}
-    make_maps(mean).to_zarr(tmp_path / "map.zarr", consolidated=False)
-    make_maps(mean, method="laplace").to_zarr(tmp_path / "bare.zarr", consolidated=False)
-    truth = xr.Dataset({"true_roughness": 0.5}, attrs={"name": "leaf"})
-    truth.to_zarr(tmp_path / "leaf.zarr", consolidated=False)
-    return tmp_path
-
-
-def test_a_map_has_a_page(
-    files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    words = ["report", str(files / "map.zarr"), "--out", str(files / "report")]
+def test_a_map_has_a_page(inputs: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+    words = ["report", str(inputs / "map.zarr"), "--out", str(tmp_path)]
     assert main(words) == 0
-    page = files / "report" / "index.html"
-    explorer = files / "report" / "explore.html"
+    page, explorer = tmp_path / "index.html", tmp_path / "explore.html"
     assert capsys.readouterr().out == f"report: {page}\nmap to point at: {explorer}\n"
     assert "The page was made without the capture" in explorer.read_text()
     with monkeypatch.context() as without:
@@ -44,28 +29,10 @@ def test_a_map_has_a_page(
     told = capsys.readouterr().out.splitlines()[1]
     assert told == f"There is no map to point at, because Bokeh is not installed: {INSTALL}."
     assert "Map report: map" in page.read_text()
-    words += ["--truth", str(files / "leaf.zarr"), "--uncorrected", str(files / "bare.zarr")]
+    words += ["--truth", str(inputs / "leaf.zarr"), "--uncorrected", str(inputs / "bare.zarr")]
     assert main(words) == 0
     assert "Map report: leaf" in page.read_text()
     assert "uncorrected" in page.read_text()
-
-
-@each(
-    ("options", "says"),
-    [
-        (["nowhere.zarr"], "nowhere.zarr: there is no such store"),
-        (["map.zarr", "--uncorrected", "bare.zarr"], "give --truth as well"),
-        (["map.zarr", "--truth", "nowhere.nc"], "nowhere.nc: there is no such file"),
-        (["map.zarr", "--truth", "leaf.zarr", "--uncorrected", "map.zarr"], "corrected as well"),
-    ],
-)
-def test_a_mistake_gets_one_line(files, options, says, capsys, monkeypatch) -> None:
-    monkeypatch.chdir(files)
-    assert main(["report", *options, "--out", "report"]) == 1
-    told = capsys.readouterr()
-    assert says in told.err
-    assert told.err.count("\n") == 1
-    assert not (files / "report").exists()
 
 
 def test_a_finished_map_is_resumed_with_status_0(tmp_path, capsys, monkeypatch) -> None:
@@ -83,14 +50,7 @@ def test_a_finished_map_is_resumed_with_status_0(tmp_path, capsys, monkeypatch) 
     assert "it was begun with another capture or other settings" in capsys.readouterr().err
 
 
-def test_what_an_image_shares_is_told_with_its_interval(tmp_path, capsys) -> None:
-    plate_image(3, 4).to_zarr(tmp_path / "plates.zarr", consolidated=False)
-    words = ["map", str(tmp_path / "plates.zarr"), "--out", str(tmp_path / "map.zarr")]
-    assert main([*words, "--scene", "goniometer", "--share", "roughness"]) == 1
-    told = capsys.readouterr().err
-    assert "map: --share roughness: an image cannot share it; give names among" in told
-    assert "stokes_error_factor" in told
-    assert not (tmp_path / "map.zarr").exists()
+def test_what_an_image_shares_is_told_with_its_interval(tmp_path) -> None:
     shared = {
         "stokes_error_factor": {
             "quantiles": {"0.025": 0.9, "0.5": 1.0, "0.975": 1.1},

@@ -5,9 +5,7 @@ from pathlib import Path
 import numpy as np
 import pictures
 import pytest
-from cases import each
 from pictures import BALL, LAMP
-from PIL import Image
 
 import polar_bayes as pb
 from polar_bayes.cli import main
@@ -18,37 +16,19 @@ LIGHT = ["--light", str(LAMP.x), str(LAMP.y), str(LAMP.z)]
 FULL = ["--saturation-level", "1000"]
 
 
-@pytest.fixture(scope="module")
-def raw() -> np.ndarray:
-    return np.rint(pictures.frames(ANGLES)).astype(np.uint16)
-
-
-@pytest.fixture
-def files(raw: np.ndarray, tmp_path: Path) -> list[str]:
-    words = []
-    for angle, frame in zip(ANGLES, raw, strict=True):
-        path = tmp_path / f"ball{angle:.0f}.npy"
-        np.save(path, frame)
-        words += ["--frame", str(angle), str(path)]
-    return words
-
-
-def test_frames_behind_a_polarizer(files, raw, tmp_path, capsys) -> None:
+def test_frames_behind_a_polarizer(inputs, tmp_path, capsys) -> None:
+    paths = {angle: inputs / f"ball{angle:.0f}.npy" for angle in ANGLES}
+    files = [word for angle, path in paths.items() for word in ("--frame", str(angle), str(path))]
     out = tmp_path / "ball.nc"
     noise = ["--gain", "0.2", "--read-noise", "2", "--relative-error", "0", "--dark-level", "1"]
     words = [*files, *SPHERE, *LIGHT, *FULL, *noise, "--bin", "2", "--window", "1"]
     words += ["--wavelength", "550", "--name", "ball", "--transfer", "1.8"]
     assert main(["import", "polarizer", *words, "--out", str(out)]) == 0
     said = capsys.readouterr().out
-    detector = pb.importers.Detector(
-        saturation_level=1000.0,
-        dark=1.0,
-        gain=0.2,
-        read_noise=2.0,
-        relative_error=0.0,
-        transfer=1.8,
-    )
+    stated = {"gain": 0.2, "read_noise": 2.0, "relative_error": 0.0}
+    detector = pb.importers.Detector(saturation_level=1000.0, dark=1.0, transfer=1.8, **stated)
     known = {"shape": BALL, "light": LAMP, "detector": detector, "bin": 2, "window": 1}
+    raw = [np.load(path) for path in paths.values()]
     wanted = pb.from_polarizer(raw, ANGLES, wavelength=550.0, name="ball", **known)
     found = pb.load_capture(out)
     assert found.drop_attrs().equals(wanted.drop_attrs())
@@ -99,35 +79,3 @@ def rim() -> np.ndarray:
     around = np.linspace(0.0, 6.0, 9)
     row = BALL.row + BALL.radius * np.sin(around)
     return np.stack([row, BALL.column + BALL.radius * np.cos(around)], axis=-1)
-
-
-@each(
-    ("words", "said"),
-    [
-        ([*LIGHT], "give one of --sphere or --rim, --normals"),
-        ([*SPHERE], "give one of --light, --light-position, --highlight, --surroundings"),
-        ([*SPHERE, *LIGHT, "--surroundings"], "give one of --light"),
-        ([*SPHERE, *LIGHT, "--dark", __file__, "--dark-level", "3"], "exclude each other"),
-        ([*SPHERE, *LIGHT], "--saturation-level: the frames do not say"),
-        ([*SPHERE, *LIGHT, *FULL, "--dark", "none.npy"], "none.npy: there is no such file"),
-        ([*SPHERE, "--highlight", "0", "0", *FULL], "there is no surface"),
-        ([*SPHERE, *LIGHT, *FULL, "--transfer", "rec709"], "transfer: it is 'rec709'"),
-        ([*SPHERE, *LIGHT, *FULL, "--dark", "curved.png"], "undo it by --transfer srgb or"),
-    ],
-)
-def test_a_mistake_takes_one_line_and_writes_nothing(
-    files: list[str],
-    words: list[str],
-    said: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    out = tmp_path / "ball.nc"
-    monkeypatch.chdir(tmp_path)
-    Image.new("L", (48, 40)).save("curved.png", icc_profile=b"a tone curve")
-    assert main(["import", "polarizer", *files, *words, "--out", str(out)]) == 1
-    error = capsys.readouterr().err
-    assert said in error
-    assert error.count("\n") == 1
-    assert not out.exists()

@@ -47,5 +47,3 @@ def test_scenes_are_compared_and_what_remains_is_written(plate, tmp_path, capsys
     assert said["sentences"][0] == fitted
     result = pb.load(out, "fit")
     assert pb.scenes.scene_sentences(result) == said["sentences"]
-    assert main(["scenes", str(plate), "--method", "point", "--out", str(out)]) == 1
-    assert "no width to compare" in capsys.readouterr().err

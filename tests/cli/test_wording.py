@@ -88,50 +88,6 @@ def test_no_sentence_of_an_import_keeps_an_argument_of_python() -> None:
     assert not left
 
 
-READINGS = "angle;perp;parallel\n20;47;36\n30;51;33\n40;58;27\n"
-
-
-@each(
-    ("words", "hints"),
-    [
-        (["table", "{}"], ["--column VARIABLE angle", "--ignore angle", "import goniometer"]),
-        (
-            ["table", "{}", "--column", "intensity", "perp", "--ignore", "angle",
-             "--ignore", "parallel"],
-            ["--column view_zenith COLUMN", "--constant view_zenith NUMBER", "by --angle"],
-        ),
-        (["table", "{}", "--angle", "angle", "--angle-set-by", "eye"], ["--angle-set-by eye: "]),
-        (["goniometer", "--angle-set-by", "stage"], ["give --s and --p, or one of --s,"]),
-        (["goniometer", "--table", "{}", "--s", "perp", "--p", "parallel"], ["by --angle"]),
-        (
-            ["goniometer", "--table", "{}", "--angle", "angle", "--s", "parallel", "--p", "perp"],
-            ["swap --s and --p, or give --s-incident and --p-incident"],
-        ),
-        (
-            ["goniometer", "--table", "{}", "--angle", "angle", "--s", "perp", "--p", "parallel",
-             "--s-incident", "40"],
-            ["--s-incident and --p-incident, or neither"],
-        ),
-        (
-            ["goniometer", "--table", "{}", "--angle", "angle", "--s", "perp", "--dark-level",
-             "60"],
-            ["the right --dark-level, or the noise without light by --s-error"],
-        ),
-        (["ellipsometer", "--table", "{}", "--psi", "perp"], ["or degrees, by --angle"]),
-    ],
-)  # fmt: skip
-def test_a_refused_import_names_options(
-    words: list[str], hints: list[str], tmp_path: Path, capsys
-) -> None:
-    table = tmp_path / "plate.csv"
-    table.write_text(READINGS)
-    out = ["--out", str(tmp_path / "plate.nc")]
-    assert main(["import", *(word.format(table) for word in words), *out]) == 1
-    said = capsys.readouterr().err
-    assert all(hint in said for hint in hints), said
-    assert not PYTHON.findall(said)
-
-
 def _texts(tree: ast.AST) -> Iterator[str]:
     """Every text of a program but its docstrings, with X for what is filled in."""
     inside = {

@@ -7,10 +7,10 @@ import pictures
 import pytest
 import xarray as xr
 from cases import each
+from pictures import FOUR
 
 import polar_bayes as pb
 
-FOUR = (0.0, 45.0, 90.0, 135.0)
 CAMERA = {
     "shape": pictures.ball_normals(),
     "light": pictures.LAMP,
@@ -33,10 +33,7 @@ def polarizer(folder: Path) -> xr.Dataset:
 
 def mosaic(folder: Path) -> xr.Dataset:
     del folder
-    frames, raw = pictures.frames(FOUR), np.zeros(pictures.SHAPE)
-    for (row, column), angle in {(0, 0): 90.0, (0, 1): 45.0, (1, 0): 135.0, (1, 1): 0.0}.items():
-        raw[row::2, column::2] = frames[FOUR.index(angle)][row::2, column::2]
-    return pb.from_mosaic(raw, **CAMERA)
+    return pb.from_mosaic(pictures.mosaic(pictures.frames(FOUR)), **CAMERA)
 
 
 def table(folder: Path) -> xr.Dataset:

@@ -109,19 +109,27 @@ def test_readings_that_are_not_valid_are_not_looked_at(write):
 
 
 @settings(deadline=None)  # a machine may be busy
-@given(st.data())
-def test_the_order_of_lines_changes_nothing(tmp_path_factory, data):
+@given(data=st.data())
+def test_the_order_of_lines_changes_nothing(in_order, data):
     """Of directions that are read once at each wavelength."""
-    lines = [f"{zenith},{wave},{zenith / 100 + wave / 1e4}" for zenith in (10, 20, 30)
-             for wave in (450, 550)]  # fmt: skip
-    order = data.draw(st.permutations(lines))
+    read, capture = in_order
+    xr.testing.assert_identical(read(data.draw(st.permutations(LINES))), capture)
+
+
+LINES = [f"{zenith},{wave},{zenith / 100 + wave / 1e4}" for zenith in (10, 20, 30)
+         for wave in (450, 550)]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def in_order(tmp_path_factory):
+    """A function that reads lines, and the capture of the lines in order."""
     path = tmp_path_factory.mktemp("tables") / "leaf.csv"
 
     def read(rows):
         path.write_text("\n".join(["view_zenith,wavelength,dop", *rows]))
         return from_table(path, constants=ANGLES).sortby("view_zenith")
 
-    xr.testing.assert_identical(read(order), read(lines))
+    return read, read(LINES)
 
 
 REFUSED = [

@@ -11,28 +11,24 @@ import pytest
 from browsers import WIDTHS, browser, faults, open_page, printed
 from cases import each
 from pages import EVIL
+from reporting.test_pages import odd
 from selenium import webdriver
 from selenium.webdriver.common.by import By
 from synthetic_accuracy import make_accuracy
 from synthetic_calibrations import make_calibration
 from synthetic_maps import make_maps
-from synthetic_results import edit_provenance, make_result, pool
+from synthetic_results import SMALL, edit_provenance, make_result, pool
 
 import polar_bayes as pb
 from polar_bayes.diagnostics.convergence import summary
 
-SMALL = {"wavelengths": (), "views": 10, "draws": 120, "variables": ("dop",)}
-
 
 def evil_fit():
-    """Names that are markup, formulas, endless, or made of spaces."""
-    result = make_result(
-        **SMALL, materials=(EVIL, "=1+2", "a" * 200, "b c " * 60), discrepancy=True, name=EVIL
+    """Names that are markup, endless, or made of spaces, wherever there is a name."""
+    own = {"model_source": f"</code></pre>{EVIL}", "priors": {EVIL: EVIL * 20}}
+    return edit_provenance(
+        odd(), **own, comparisons_failed={EVIL: EVIL, "without_instrument": EVIL}
     )
-    odd = {"model_source": f"</code></pre>{EVIL}", "problems": [EVIL], "scene": EVIL}
-    odd["capture"] = {EVIL: EVIL, "name": f"{EVIL}{'n' * 300}"}
-    odd["comparisons_failed"] = {EVIL: EVIL, "without_instrument": EVIL}
-    return edit_provenance(result, **odd, priors={EVIL: EVIL * 20})
 
 
 REPORTS = {

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic_results import make_result, replace
+from synthetic_results import SMALL, make_result, worse
 
 import polar_bayes as pb
 from polar_bayes.cli import main
@@ -12,14 +12,6 @@ from polar_bayes.errors import FitError
 from polar_bayes.reporting.report import render
 
 pytestmark = pytest.mark.usefixtures("unpainted")
-
-SMALL = {"wavelengths": (), "views": 16, "draws": 150, "variables": ("dop",)}
-
-
-def worse(by: float, **asked):
-    result = make_result(**SMALL, **asked)
-    density = result["log_likelihood"].to_dataset()["dop"]
-    return replace(result, "log_likelihood", "dop", density - by * (1 + density["view"] % 3))
 
 
 def test_several_fits_by_name_have_the_figure_of_their_comparison() -> None:

@@ -11,14 +11,12 @@ from pages import Page
 from synthetic_accuracy import make_accuracy
 from synthetic_calibrations import make_calibration
 from synthetic_maps import make_maps
-from synthetic_results import make_result, pool
+from synthetic_results import SMALL, make_result, pool
 
 import polar_bayes as pb
 from polar_bayes.reporting.page import csv_link
 
 pytestmark = pytest.mark.usefixtures("unpainted")
-
-SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
 
 
 def read(link: str) -> pd.DataFrame:

@@ -5,31 +5,26 @@ import pytest
 import xarray as xr
 from cases import each
 from clipping import clipped
+from synthetic_maps import make_maps
 
 import polar_bayes as pb
+from polar_bayes.inference.batching import MethodUsed, Status
+
+NAMES = ("roughness", "subsurface_fraction", "absorption", "refractive_index")
+STATUSES = (Status.GOOD, Status.MASKED, Status.TOO_FEW_VIEWS, Status.NOT_TRUSTED)
 
 
-def maps(rows: int = 20, columns: int = 30, wavelengths: tuple[float, ...] = ()) -> xr.Dataset:
-    rng = np.random.default_rng(0)
-    shape, dims = (rows, columns), ("y", "x")
-    found: dict = {}
-    for name in ("roughness", "subsurface_fraction", "absorption", "refractive_index"):
-        own = wavelengths if name in ("absorption", "refractive_index") else ()
-        mean = rng.uniform(0.2, 0.4, (*shape, *([len(own)] if own else [])))
-        mean[0, 0] = np.nan
-        axes = (*dims, "wavelength") if own else dims
-        found[name] = (axes, mean)
-        ends = np.linspace(-0.1, 0.1, 7).reshape(7, *[1] * mean.ndim)
-        found[f"{name}_quantile"] = (("quantile", *axes), mean + ends)
-    found["pareto_k"] = (dims, rng.uniform(0.0, 1.0, shape))
-    words = {"method": "none laplace importance nuts", "status": "good masked too_few_views"}
-    words["status"] += " not_converged not_trusted"
-    for name, meanings in words.items():
-        flags = rng.integers(0, len(meanings.split()), shape)
-        found[name] = (dims, flags, {"flag_meanings": meanings})
-    levels = [0.025, 0.1, 0.25, 0.5, 0.75, 0.9, 0.975]
-    coords = {"quantile": levels} | ({"wavelength": list(wavelengths)} if wavelengths else {})
-    return xr.Dataset(found, coords=coords)
+def maps(
+    rows: int = 20, columns: int = 30, wavelengths: tuple[float, ...] = (), statuses=STATUSES
+) -> xr.Dataset:
+    """Maps of four parameters, two of them over the wavelength; the first pixel has no mean."""
+    rng, shape, means = np.random.default_rng(0), (rows, columns), {}
+    for name in NAMES:
+        color = wavelengths if name in NAMES[2:] else ()
+        means[name] = rng.uniform(0.2, 0.4, (*shape, *([len(color)] if color else [])))
+        means[name][0, 0] = np.nan
+    status, methods = rng.choice(statuses, shape), rng.choice(MethodUsed, shape)
+    return make_maps(means, status=status, methods=methods, wavelengths=wavelengths, width=0.2)
 
 
 @each("wavelengths", [(), (450.0, 650.0)])
@@ -44,14 +39,13 @@ def test_every_parameter_has_its_mean_and_its_width(wavelengths: tuple[float, ..
 
 @pytest.mark.thorough
 def test_a_pixel_without_numbers_is_not_drawn_as_good() -> None:
-    image = maps()
-    image["status"][:] = 0
+    image = maps(statuses=[Status.GOOD])
     image["status"][3, 4] = -1
     panel = pb.plots.plot_maps(image).axes
     status = next(axes for axes in panel if axes.get_title("left") == "status")
     drawn = np.asarray(status.images[0].get_array())
     assert set(zip(*np.nonzero(drawn), strict=True)) == {(0, 0), (3, 4)}  # the first has no mean
-    assert drawn[0, 0] == drawn[3, 4] == 5
+    assert drawn[0, 0] == drawn[3, 4] == list(Status).index(Status.NOT_FITTED)
 
 
 @pytest.mark.thorough

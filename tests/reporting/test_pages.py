@@ -18,10 +18,11 @@ import pytest
 import xarray as xr
 from cases import each
 from pages import EVIL, Page, blank_pictures, faults_of
+from plates import plate_capture
 from synthetic_accuracy import make_accuracy
 from synthetic_calibrations import NAMES, make_calibration
 from synthetic_maps import make_maps
-from synthetic_results import edit_provenance, make_result, pool, replace
+from synthetic_results import SMALL, edit_provenance, make_result, moved, pool, with_law, worse
 
 import polar_bayes as pb
 from polar_bayes.inference.batching import MethodUsed, Status
@@ -30,28 +31,12 @@ from polar_bayes.reporting.report import render
 pytestmark = pytest.mark.usefixtures("unpainted")
 
 APPROVED = Path(__file__).with_name("approved")
-SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
 SHAPE = (10, 20)
 MEANS = {
     "roughness": np.full(SHAPE, 0.5),
     "subsurface_fraction": np.linspace(0.2, 0.4, 200).reshape(SHAPE),
     "concentration_scale": np.full(SHAPE, 300.0),
 }
-
-
-def moved(by: float, chains: slice = slice(1), **asked: object) -> xr.DataTree:
-    """A result some of whose chains are elsewhere in roughness."""
-    result = make_result(**SMALL, **asked)
-    draws = result["posterior"].to_dataset()["roughness"].to_numpy().copy()
-    draws[chains] += by
-    return replace(result, "posterior", "roughness", draws)
-
-
-def worse(by: float) -> xr.DataTree:
-    """A result that predicts its readings worse."""
-    result = make_result(**SMALL)
-    density = result["log_likelihood"].to_dataset()["dop"]
-    return replace(result, "log_likelihood", "dop", density - by * (1 + density["view"] % 3))
 
 
 def populations(**asked: object) -> xr.DataTree:
@@ -63,21 +48,17 @@ def populations(**asked: object) -> xr.DataTree:
 
 def colored() -> xr.DataTree:
     """An index by Cauchy's law, and a model of the user's own."""
-    result = make_result(views=6, draws=60, variables=("dop",))
-    posterior, rng = result["posterior"].to_dataset(), np.random.default_rng(5)
-    a, b = (
-        (("chain", "draw"), x + s * rng.standard_normal((4, 60)))
-        for x, s in ((1.45, 0.01), (0.005, 0.001))
-    )
-    posterior = posterior.assign(cauchy_a=a, cauchy_b=b)
-    index = posterior["cauchy_a"] + posterior["cauchy_b"] / (posterior["wavelength"] / 1e3) ** 2
-    posterior["refractive_index"] = index.transpose("chain", "draw", "wavelength")
-    result["posterior"] = xr.DataTree(posterior)
-    scene = pb.Scene(surface=pb.SmoothSurface(), dispersion=pb.physics.Cauchy())
     source = f"def story(data):\n    # {EVIL}\n    return 1 < 2\n"
-    swapped = ["scene", "model", *(f"prior of p{i}" for i in range(8)), f"{EVIL} held fixed"]
-    own = {"scene": "custom", "scene_parts": repr(scene), "model_source": source}
-    return edit_provenance(result, **own, model="story", swapped=swapped, fixed={EVIL: 1.45})
+    swapped = ["scene", "model", *(f"prior of p{i}" for i in range(7)), "prior of roughness"]
+    swapped += [f"{EVIL} held fixed"]
+    own = {
+        "model": "story",
+        "model_source": source,
+        "swapped": swapped,
+        "declared": {"tilt": "Normal"},
+    }
+    own["model_settings"] = {"pooled": ["roughness"], "process": {"kernel": "matern52"}}
+    return edit_provenance(with_law(), **own, fixed={EVIL: 1.45})
 
 
 def odd() -> xr.DataTree:
@@ -145,6 +126,10 @@ def study_in_a_fit() -> xr.DataTree:
 CASES: dict[str, Callable[[], str]] = {
     "fit": lambda: render(make_result(wavelengths=(450.0, 550.0), views=20, discrepancy=True)),
     "failed fit": lambda: render(moved(1.0)),
+    "scattered": lambda: render(make_result(**SMALL | {"draws": 250}, noise=4.0)),
+    "doubted": lambda: render(
+        edit_provenance(make_result(**SMALL), prior_probability={"roughness": [0.997]})
+    ),
     "markup": lambda: render(odd()),
     "populations": lambda: render(populations(method="laplace")),
     "color": lambda: render(colored()),
@@ -208,8 +193,12 @@ def check_page(name: str, make: Callable[[], str]) -> None:
     page = Page(make())
     assert faults_of(page) == []
     assert "nan" not in page.text.split()
+    check_approved(name, page.lines)
+
+
+def check_approved(name: str, lines: list[str]) -> None:
     approved = approved_file(name).read_text().splitlines()
-    changed = list(difflib.unified_diff(approved, page.lines, "approved", "now", n=0, lineterm=""))
+    changed = list(difflib.unified_diff(approved, lines, "approved", "now", n=0, lineterm=""))
     assert not changed, "\n".join(changed)
 
 
@@ -222,6 +211,34 @@ def test_a_page_says_what_was_approved(name: str) -> None:
 @each("name", MORE)
 def test_a_page_of_a_rarer_result_says_what_was_approved(name: str) -> None:
     check_page(name, MORE[name])
+
+
+CARDS: dict[str, Callable[[], object]] = {
+    "fit": lambda: make_result(**SMALL),
+    "failed fit": lambda: moved(1.0),
+    "thirty materials": lambda: make_result(
+        **SMALL | {"views": 4, "draws": 30}, materials=tuple(map(str, range(30)))
+    ),
+    "capture": lambda: plate_capture(np.linspace(20.0, 70.0, 5), 0.02, seed=1).drop_attrs(
+        deep=False
+    ),
+    "scene": lambda: pb.setups.SETUPS["goniometer"].scene,
+    "set-up": lambda: pb.setups.SETUPS["goniometer"],
+    "prior": lambda: {"angle_zero": pb.PRIORS["angle_zero"]},
+}
+
+
+def cards() -> list[str]:
+    """The lines of every card."""
+    return [
+        line
+        for name, make in CARDS.items()
+        for line in (f"--- {name}", *repr(pb.show(make())).splitlines())
+    ]
+
+
+def test_a_card_says_what_was_approved() -> None:
+    check_approved("cards", cards())
 
 
 @each("group", ["noise_free", "posterior_predictive"])
@@ -281,6 +298,7 @@ def write_all() -> None:
     with blank_pictures():
         for name, make in (CASES | MORE).items():
             approved_file(name).write_text("\n".join(Page(make()).lines) + "\n")
+    approved_file("cards").write_text("\n".join(cards()) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """Shrinkage plots, and what the page says about populations and about what was swapped."""
 
-import re
-
 import numpy as np
 import pytest
 import xarray as xr
@@ -14,7 +12,6 @@ from polar_bayes.diagnostics.view import view_of
 from polar_bayes.errors import FitError
 from polar_bayes.reporting import fit_page
 from polar_bayes.reporting import text as sentences
-from polar_bayes.reporting.fit_page import provenance_facts
 from polar_bayes.reporting.plots_fit import MAX_MEMBERS, plot_shrinkage
 from polar_bayes.reporting.report import render
 from polar_bayes.reporting.text import swapped_sentence
@@ -123,53 +120,13 @@ def test_tables_have_a_cell_for_every_head() -> None:
 # --- what was swapped -----------------------------------------------------------------------------
 
 
-@each(
-    ("swapped", "said"),
-    [
-        (
-            [],
-            "No part of the model was replaced: scene, links and priors are the package's "
-            "defaults.",
-        ),
-        (["scene"], "Replaced by the user: the scene."),
-        (
-            ["scene", "model", "prior of roughness", "prior of absorption"],
-            "Replaced by the user: the scene, the model and the priors of roughness and "
-            "absorption.",
-        ),
-        (["refractive_index held fixed"], "Held fixed: refractive_index."),
-        (
-            ["links", *(f"prior of p{i}" for i in range(8))],
-            "Replaced by the user: the links and the priors of p0, p1, p2, p3, p4, p5 and 2 more.",
-        ),
-    ],
-)
-def test_what_was_swapped_is_a_sentence(swapped, said) -> None:
-    assert swapped_sentence({"swapped": swapped}) == said
-
-
-@pytest.mark.thorough
-def test_nothing_is_said_of_a_result_that_does_not_tell() -> None:
+def test_what_was_swapped_is_a_sentence() -> None:
+    """Beside those of approved pages."""
     assert swapped_sentence({}) == ""
-
-
-def test_provenance_marks_what_was_swapped() -> None:
-    provenance = {
-        "model": "my_story",
-        "scene": "paper",
-        "priors": {"roughness": "HalfNormal(0.1)", "absorption": "LogNormal(-1, 0.5)"},
-        "links": {"dop": "BetaLink()"},
-        "declared": {"tilt": "Normal"},
-        "model_settings": {"pooled": ["roughness"], "process": {"kernel": "matern52"}},
-        "fixed": {"refractive_index": 1.45},
-        "swapped": ["model", "prior of roughness", "refractive_index held fixed"],
-    }
-    row = r"<dt>(.*?)</dt><dd>(.*?)(?: <mark>(.*?)</mark>)?</dd>"
-    blocks = [facts.partition("</h3>") for facts in provenance_facts(provenance) if facts]
-    groups = {title.removeprefix("<h3>"): re.findall(row, rows) for title, _, rows in blocks}
-    marked = {name for rows in groups.values() for name, _, mark in rows if mark == "replaced"}
-    assert marked == {"model", "roughness"}
-    assert groups["Priors that stand in the model itself"] == [("tilt", "Normal", "")]
-    assert groups["Held fixed, by the model or around it"] == [("refractive_index", "1.45", "")]
-    values = [value for _, value, _ in groups["Settings of the model"]]
-    assert values == ["roughness", "kernel matern52"]
+    assert swapped_sentence({"swapped": []}) == (
+        "No part of the model was replaced: scene, links and priors are the package's defaults."
+    )
+    links = ["links", *(f"prior of p{i}" for i in range(8))]
+    assert swapped_sentence({"swapped": links}) == (
+        "Replaced by the user: the links and the priors of p0, p1, p2, p3, p4, p5 and 2 more."
+    )

@@ -5,9 +5,8 @@ import pytest
 import xarray as xr
 from cases import each
 from clipping import clipped
-from synthetic_results import edit_provenance, make_result, replace
+from synthetic_results import edit_provenance, make_result, replace, with_law
 
-import polar_bayes as pb
 from polar_bayes.diagnostics.view import view_of
 from polar_bayes.errors import FitError
 from polar_bayes.reporting import plots_curves as module
@@ -17,26 +16,6 @@ from polar_bayes.reporting.report import render
 pytestmark = pytest.mark.usefixtures("unpainted")
 
 SMALL = {"views": 6, "draws": 60, "variables": ("dop",)}
-
-
-def with_law(scene=None, **settings):
-    """A result whose index follows Cauchy's law, with the coefficients of every draw."""
-    result = make_result(**{**SMALL, **settings})
-    posterior = result["posterior"].to_dataset()
-    rng = np.random.default_rng(5)
-    grid = (posterior.sizes["chain"], posterior.sizes["draw"])
-    a, b = (
-        xr.DataArray(x + s * rng.standard_normal(grid), dims=("chain", "draw"))
-        for x, s in ((1.45, 0.01), (0.005, 0.001))
-    )
-    posterior["cauchy_a"], posterior["cauchy_b"] = a, b
-    index = a + b / (posterior["wavelength"] / 1e3) ** 2
-    posterior["refractive_index"] = index.transpose("chain", "draw", "wavelength")
-    result["posterior"] = xr.DataTree(posterior)
-    parts = pb.Scene(surface=pb.SmoothSurface(), dispersion=pb.physics.Cauchy())
-    return edit_provenance(
-        result, scene="custom", scene_parts=repr(parts) if scene is None else scene
-    )
 
 
 def test_intervals_where_nothing_ties_the_colors() -> None:
@@ -70,7 +49,9 @@ def test_a_law_of_dispersion_has_bands_between_and_beyond_the_colors() -> None:
 @pytest.mark.thorough
 @each("scene", ["Scene(dispersion=<function law at 0x7f>)", "Scene(dispersion=Mine(a=1))"])
 def test_a_law_that_cannot_be_read_leaves_intervals(scene: str) -> None:
-    assert not spectra(with_law(scene))["refractive_index"][0].is_band
+    assert not spectra(edit_provenance(with_law(), scene_parts=scene))["refractive_index"][
+        0
+    ].is_band
 
 
 def test_a_process_is_drawn_from_its_prediction(monkeypatch) -> None:

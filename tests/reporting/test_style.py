@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from synthetic_accuracy import make_accuracy
 from synthetic_calibrations import make_calibration
 from synthetic_maps import make_maps
-from synthetic_results import make_result, pool
+from synthetic_results import SMALL, make_result, pool
 
 import polar_bayes as pb
 from polar_bayes.reporting.report import report
@@ -32,7 +32,6 @@ DRAWN = {
     "plot_shrinkage": lambda: pb.plots.plot_shrinkage(pooled(), "roughness"),
     "plot_spectrum": lambda: pb.plots.plot_spectrum(make_result(views=12, draws=150), "absorption"),
 }
-SMALL = {"wavelengths": (), "views": 12, "draws": 150, "variables": ("dop",)}
 
 
 def compared():
