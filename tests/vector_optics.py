@@ -18,6 +18,12 @@ def ray(zenith: float, azimuth: float) -> np.ndarray:
     return np.array([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
 
 
+def angles(vector: np.ndarray) -> tuple[float, float]:
+    """Zenith and azimuth of a vector, in degrees."""
+    x, y, z = vector
+    return float(np.rad2deg(np.arctan2(np.hypot(x, y), z))), float(np.rad2deg(np.arctan2(y, x)))
+
+
 def axes(zenith: float, azimuth: float) -> np.ndarray:
     """Both axes of a ray, as rows; on the normal they are the limit along the azimuth."""
     phi = np.deg2rad(azimuth)

@@ -133,15 +133,6 @@ def test_discrepancy_of_many_functions_is_the_kernel() -> None:
 # --- where light is lost on the way to the number -------------------------------------------------
 
 
-def kept(view_zenith: float, fills: float) -> float:
-    """Share of the light that overlap leaves."""
-    geometry = Geometry(*(jnp.array([x]) for x in (view_zenith, 0.0, 30.0, 180.0)))
-    light = Light(*(jnp.array([x]) for x in (1.0, 0.4, -0.2)))
-    recorded = BeamOverlap().record({"beam_overlap_zenith": jnp.array([fills])}, geometry, light)
-    assert (recorded.q, recorded.u) == (light.q, light.u)
-    return float(recorded.intensity[0])
-
-
 def test_an_analyzer_obeys_malus() -> None:
     """Fully polarized light at 20 degrees passes as the squared cosine of what is between."""
     angles = (0.0, 20.0, 65.0, 110.0)

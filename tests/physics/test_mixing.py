@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
 from polar_bayes.physics.stokes import Light, degree_of_linear_polarization
 
-RULES = each("rule", [DopMixing(), DopMixing(signed=True), StokesMixing()])
 component = st.floats(-0.7, 0.7)
 
 

@@ -10,11 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from digits import grid
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physics.test_half_space import hemisphere, read, refracted, transmittance, under_beam
+from optics import directions, read
+from physics.test_half_space import hemisphere, refracted, transmittance, under_beam
 
-from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.half_space import CLEAREST, Ray
 from polar_bayes.physics.illumination import UniformSky
 from polar_bayes.physics.mixing import StokesMixing
@@ -88,17 +89,12 @@ def test_isotropic_scattering_in_closed_form_agrees_with_all_orders() -> None:
     Light that the interface turns back enters again at one cosine, which costs most where light
     stays longest: in a clear body of index 2.
     """
-    n, albedo, light, view = (
-        np.array(column)
-        for column in zip(
-            *itertools.product(
-                [1.0, 1.33, 1.5, 2.0],
-                [0.05, 0.5, 0.9, 0.99, 1.0 / (1.0 + CLEAREST)],
-                [0.0, 40.0, 80.0, 89.0],
-                [0.0, 30.0, 60.0, 85.0],
-            ),
-            strict=True,
-        )
+    n, albedo, light, view = grid(
+        float,
+        [1.0, 1.33, 1.5, 2.0],
+        [0.05, 0.5, 0.9, 0.99, 1.0 / (1.0 + CLEAREST)],
+        [0.0, 40.0, 80.0, 89.0],
+        [0.0, 30.0, 60.0, 85.0],
     )
     exact = under_beam(n, albedo, 0.0 * n, light, view, 0.0)[0]
     found = through_a_plane(Isotropic(), n, 1.0 / albedo - 1.0, light, view)
@@ -231,9 +227,7 @@ class ManyTurns(HenyeyGreenstein):
 
 def test_a_few_azimuths_stand_for_a_sky() -> None:
     """Dense towards the forward lobe: within .2%, also at grazing without refraction."""
-    views = Geometry.from_degrees(
-        view_zenith=[0.0, 45.0, 87.0], view_azimuth=20.0, light_zenith=0.0, light_azimuth=0.0
-    )
+    views = directions([0.0, 45.0, 87.0], 20.0, 0.0)
     surface = RoughSurface(illumination=UniformSky(), way_out=SmoothExit())
     light = jax.jit(Scene.light, static_argnums=0)
     for g in (0.5, 0.9):

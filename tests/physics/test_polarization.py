@@ -8,6 +8,7 @@ import vector_optics as twin
 from cases import each
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from optics import BEAM, at, components, stokes_of
 
 from polar_bayes.physics.coat import ClearCoat, ThinFilm
 from polar_bayes.physics.geometry import Geometry, cos_degrees
@@ -25,24 +26,19 @@ degree = st.floats(0.0, 1.0)
 angle = st.floats(-180.0, 180.0)
 index = st.floats(1.01, 3.0)
 
-BEAM = PointSource(LinearPolarization("degree", "angle"))
 MIRROR = Scene(SmoothSurface(BEAM))
-stokes_of = jax.jit(Scene.stokes, static_argnums=0)
-
-
-def at(view: tuple[float, float], light: tuple[float, float]) -> Geometry:
-    return Geometry(*(jnp.array([x]) for x in (*view, *light)), wavelength=jnp.array([550.0]))
 
 
 def mirrored(
     view: tuple, light: tuple, n: float, degree: float, angle: float, scene: Scene = MIRROR
 ) -> np.ndarray:
-    parameters = {"refractive_index": n, "degree": degree, "angle": angle, "roughness": 0.3}
+    parameters = {
+        "refractive_index": n,
+        "light_degree": degree,
+        "light_angle": angle,
+        "roughness": 0.3,
+    }
     return np.asarray(stokes_of(scene, parameters, at(view, light)))[0]
-
-
-def components(degree: float, angle: float) -> tuple[float, float]:
-    return degree * np.cos(np.deg2rad(2 * angle)), degree * np.sin(np.deg2rad(2 * angle))
 
 
 @given(view=direction, light=direction, n=index, degree=degree, angle=angle)
@@ -100,16 +96,6 @@ def test_degree_0_and_orthogonal_pairs_are_unpolarized_light(
         np.testing.assert_allclose(0.5 * (pair[0] + pair[1]), plain, rtol=1e-12, atol=10 * slack)
 
 
-def mueller(view: tuple, light: tuple, n: float, scene: Scene = MIRROR) -> np.ndarray:
-    """Matrix from light to viewer (3 x 3), from four incident states."""
-    none, s, diagonal, p = (
-        mirrored(view, light, n, *state, scene)
-        for state in ((0.0, 0.0), (1.0, 0.0), (1.0, 45.0), (1.0, 90.0))
-    )
-    np.testing.assert_allclose(s + p, 2.0 * none, rtol=1e-12, atol=1e-12 * none[0] + 1e-300)
-    return np.stack([none, 0.5 * (s - p), diagonal - none], axis=1)
-
-
 @pytest.mark.thorough
 @each("view", [(0.0, 20.0), (40.0, 20.0), (85.0, 20.0), (40.0, 200.0)], ids=str)
 @each("dtype", [np.float64, np.float32])
@@ -117,7 +103,7 @@ def test_derivatives_exist_where_viewer_and_light_coincide(view: tuple, dtype: t
     """The gradient over both directions, the polarization and the index; and it is a limit."""
 
     def reading(row: jax.Array) -> jax.Array:
-        parameters = {"refractive_index": row[4], "degree": row[5], "angle": row[6]}
+        parameters = {"refractive_index": row[4], "light_degree": row[5], "light_angle": row[6]}
         geometry = Geometry(*(row[i : i + 1] for i in range(4)))
         return MIRROR.stokes(parameters, geometry)[0] @ jnp.asarray([0.3, 1.0, -0.7], dtype)
 
