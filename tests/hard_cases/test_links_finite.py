@@ -63,25 +63,13 @@ LINKS = {
 }
 
 
-# One of each class in double precision, and the Beta link in single precision, by default.
+FIRST = [(name, np.float64) for name in ("Beta, steep", "Stokes, stated", "intensity")]
+FIRST += [("Beta, steep", np.float32)]  # one of each class in double precision, one in single
 RUNS = [(name, dtype) for name in LINKS for dtype in (np.float64, np.float32)]
-FIRST = [(name, np.float64) for name in ("Beta, steep", "Stokes, stated", "intensity")] + [
-    ("Beta, steep", np.float32)
-]
 
 
-@each(("name", "dtype"), FIRST)
+@each(("name", "dtype"), sorted(RUNS, key=lambda run: run not in FIRST), quick=len(FIRST))
 def test_density_gradient_and_hessian_of_a_link_are_finite(name, dtype):
-    check_finite(name, dtype)
-
-
-@pytest.mark.thorough
-@each(("name", "dtype"), [run for run in RUNS if run not in FIRST])
-def test_density_gradient_and_hessian_of_other_schedules_are_finite(name, dtype):
-    check_finite(name, dtype)
-
-
-def check_finite(name, dtype):
     variable, link, predictions, readings, levels = LINKS[name]
     stopped = (False, True) if variable == "intensity" else (False,)
     # A sensor reports nothing below zero, and stops at full scale at the latest.

@@ -1,5 +1,6 @@
 """Points, discs and skies against a renderer and against brute force."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ def test_point_source_agrees_with_the_renderer(code: int, distribution: Beckmann
     """1e-6 of the peak allows for the renderer's index in single precision (6e-8 of n)."""
     rows = PLASTIC[PLASTIC[:, 0] == code]
     n, roughness, view, light, azimuth = rows[:, 1:6].T
-    geometry = directions(*(x[:, None] for x in (view, 0.0 * view, light, azimuth)))
+    geometry = Geometry(*(x[:, None] for x in (view, 0.0 * view, light, azimuth)))
     material = {"roughness": roughness, "refractive_index": n}
     stokes = np.asarray(stokes_of(Scene(RoughSurface(distribution)), material, geometry))[:, 0]
     for pair in np.unique(rows[:, 1:3], axis=0):
@@ -146,16 +147,13 @@ def test_sun_and_sky_light_surface_and_body_together(way_out: AbstractExit) -> N
     views = directions([0.0, 50.0, 80.0], 180.0, 40.0, 20.0)
     material = {"roughness": 0.2, "subsurface_fraction": 0.4, "refractive_index": 1.5}
     material |= {"absorption": 0.3, "sky_radiance": 0.07}
-    sun, sky, both = (
-        stokes_of(
-            Scene(
-                RoughSurface(GGX(), light, FacetQuadrature(3, 2), way_out=way_out),
-                TurbidMedium(0.5),
-                StokesMixing(),
-            ),
-            material,
-            views,
+    scenes = [
+        Scene(
+            RoughSurface(GGX(), light, FacetQuadrature(3, 2), way_out=way_out),
+            TurbidMedium(0.5),
+            StokesMixing(),
         )
         for light in (PointSource(), UniformSky(), SunAndSky("sky_radiance"))
-    )
+    ]
+    sun, sky, both = jax.jit(lambda given: [each.stokes(given, views) for each in scenes])(material)
     np.testing.assert_allclose(both, sun + 0.07 * sky, rtol=1e-12)

@@ -60,7 +60,7 @@ LEVEL = {
     "sky": Scene(RoughSurface(GGX(), UniformSky(), FEW), Lambertian(), StokesMixing()),
     "turbid body": Scene(SmoothSurface(BEAM), TurbidMedium(), StokesMixing()),
 }
-COMPILER_OPTIONS = Scene(
+QUICK = Scene(
     RoughSurface(Beckmann(), BEAM, way_out=SmoothExit()), Lambertian(), StokesMixing()
 )  # compiles in no time
 EVERY_SCENE = each("name", LEVEL)
@@ -214,7 +214,7 @@ def test_a_viewer_that_passes_the_true_normal_sees_no_jump() -> None:
 @pytest.mark.thorough
 def test_slopes_are_those_of_differences() -> None:
     """Also for a viewer on the stated normal, as soon as the true one leans."""
-    scene = leaning(COMPILER_OPTIONS)
+    scene = leaning(QUICK)
     columns = ([20.0, 0.0, 1e-3], [180.0, 180.0, 70.0], [45.0] * 3, [0.0] * 3)
     views = Geometry(*(jnp.array(column) for column in columns))
 
@@ -236,24 +236,24 @@ def test_slopes_are_those_of_differences() -> None:
 def test_the_instrument_acts_on_the_stated_angles() -> None:
     """Angle zero comes before the lean; what the sensor does comes after, in its own frame."""
     terms = Instrument((AngleZero(), BeamOverlap(), DolpGain()))
-    scene = dataclasses.replace(leaning(COMPILER_OPTIONS), instrument=terms)
+    scene = dataclasses.replace(leaning(QUICK), instrument=terms)
     views, values = at((60.0, 150.0), (45.0, 0.0)), tilted((6.0, 5.0))
     moved = views._replace(view_zenith=views.view_zenith + 0.3, light_zenith=jnp.array([45.3]))
     light = scene.light(values, moved)
     found = predict(scene, values, views)
     np.testing.assert_allclose(found["q"], 0.9 * light.q, rtol=1e-12)
     np.testing.assert_allclose(found["u"], 0.9 * light.u, rtol=1e-12)
-    level = dataclasses.replace(COMPILER_OPTIONS, instrument=terms)
+    level = dataclasses.replace(QUICK, instrument=terms)
     lost = predict(level, values, views)["intensity"] / level.light(values, moved).intensity
     np.testing.assert_allclose(found["intensity"], lost * light.intensity, rtol=1e-12)
 
 
 def test_a_known_lean_is_no_parameter() -> None:
-    known = dataclasses.replace(SCENES["camera"], normal=TiltedNormal(4.0, -2.0))
-    assert known.parameters == SCENES["camera"].parameters
+    known = dataclasses.replace(QUICK, normal=TiltedNormal(4.0, -2.0))
+    assert known.parameters == QUICK.parameters
     views = at((30.0, 150.0), (45.0, 0.0))
     found, expected = (
-        predict(scene, tilted((4.0, -2.0)), views) for scene in (known, leaning(SCENES["camera"]))
+        predict(scene, tilted((4.0, -2.0)), views) for scene in (known, leaning(QUICK))
     )
     np.testing.assert_allclose(found["q"], expected["q"], rtol=1e-14)
 
