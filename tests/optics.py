@@ -8,16 +8,31 @@ import jax.numpy as jnp
 import numpy as np
 
 from polar_bayes.physics.boundary import Diattenuation
+from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
+from polar_bayes.physics.dispersion import Cauchy
 from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
 from polar_bayes.physics.illumination import PointSource
+from polar_bayes.physics.instrument import AngleZero, BeamOverlap, DolpGain, Instrument
 from polar_bayes.physics.microfacet import GGX, AnisotropicSlopes, Beckmann
+from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.stokes import LinearPolarization
+from polar_bayes.physics.subsurface import Lambertian
+from polar_bayes.physics.surface import RoughPassage, RoughSurface
 
 REFERENCE = Path(__file__).parent / "reference"
 DISTRIBUTIONS = {"Beckmann": Beckmann(), "GGX": GGX()}
 BEAM = PointSource(LinearPolarization("light_degree", "light_angle"))
 GROOVED = AnisotropicSlopes("roughness_azimuth")
+
+EVERYTHING = Scene(
+    RoughSurface(GGX(), BEAM, slopes=GROOVED, way_out=RoughPassage()),
+    Lambertian("albedo"),
+    StokesMixing(),
+    CoatStack((ThinFilm(), ClearCoat())),
+    Instrument((AngleZero(), BeamOverlap(), DolpGain())),
+    Cauchy(),
+)
 
 stokes_of = jax.jit(Scene.stokes, static_argnums=0)
 light_of = jax.jit(Scene.light, static_argnums=0)

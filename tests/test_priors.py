@@ -12,14 +12,7 @@ from scipy import stats
 
 from polar_bayes.errors import FitError
 from polar_bayes.observation.links import noise_parameters
-from polar_bayes.priors import (
-    PRIORS,
-    RANGES,
-    Beta,
-    describe_prior,
-    resolve_priors,
-    support_bounds,
-)
+from polar_bayes.priors import PRIORS, RANGES, Beta, describe_prior, resolve_priors, support_bounds
 from polar_bayes.setups import SETUPS
 
 KEY = jax.random.key(7)

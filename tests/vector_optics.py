@@ -81,7 +81,7 @@ def films(above, layers, below, sin_squared):
     `layers` are (index, 2 pi thickness/wavelength) from the top down; none for a bare boundary.
     """
     first, last = admittances(above, sin_squared), admittances(below, sin_squared)
-    electric, magnetic = np.ones(2, complex), last.astype(complex)
+    electric, magnetic = np.ones_like(last), last
     for index, wavenumber in reversed(layers):
         y = admittances(index, sin_squared)
         delta = wavenumber * index * cosine(index, sin_squared)
@@ -214,9 +214,7 @@ class Population:
         shown = self.share * np.maximum(cosine_, 0.0) / self.normal[:, 2]
         light = 2.0 * cosine_[:, None] * self.normal - towards
         b = 1.0 - cosine_**2
-        inside = np.sqrt(1.0 - b / index**2)
-        r_s = ((cosine_ - index * inside) / (cosine_ + index * inside)) ** 2
-        r_p = ((index * cosine_ - inside) / (index * cosine_ + inside)) ** 2
+        r_s, r_p, _ = bare(index, b)
         axis = np.cross(self.normal, towards)
         axis /= np.maximum(np.linalg.norm(axis, axis=-1, keepdims=True), 1e-300)
         first, other = axis @ s, axis @ second

@@ -94,9 +94,7 @@ def test_films_agree_with_characteristic_matrices(theta: float, layers: list, bo
 
 @given(theta=zenith, layer=film, body=index)
 @RUN
-def test_a_film_turns_passing_light_as_its_fields_do(
-    theta: float, layer: tuple, body: float
-) -> None:
+def test_a_film_turns_passing_light_as_its_fields_do(theta, layer, body) -> None:
     _, passed = filmed(theta, [layer], body)
     _, fields, through = twin.films(1.0, [layer], body, float(sin_degrees(theta) ** 2))
     cross = fields[0] * np.conj(fields[1]) * np.sqrt(np.prod(through / np.abs(fields) ** 2))

@@ -51,9 +51,7 @@ def test_all_round_trips_are_the_sum_of_the_series(trip: tuple, b: float) -> Non
 @pytest.mark.thorough
 @given(first=triple, second=triple)
 @RUN
-def test_contrast_and_shortfall_have_limits_at_normal_incidence(
-    first: tuple, second: tuple
-) -> None:
+def test_contrast_and_shortfall_have_limits_at_normal_incidence(first, second) -> None:
     """They depend on B smoothly: over 1e-6 they change by about as much, times at most 1/.1^3."""
     here, there = (make(first, b).times(make(second, b)).repeated() for b in (0.0, 1e-6))
     for field in ("mean", "contrast", "shortfall"):

@@ -57,9 +57,7 @@ def largest_error(
 @pytest.mark.thorough
 @of_every_integral
 @of_both
-def test_thirty_two_facets_reach_a_thousandth(
-    distribution: AbstractMicrofacet, integral: str
-) -> None:
+def test_thirty_two_facets_reach_a_thousandth(distribution, integral) -> None:
     default, small = FacetQuadrature(), FacetQuadrature(5, 5)
     assert default.along * default.across <= 32
     assert largest_error(distribution, default, integral, ROUGHNESS) < STATED[distribution]
@@ -69,9 +67,7 @@ def test_thirty_two_facets_reach_a_thousandth(
 @pytest.mark.thorough
 @of_every_integral
 @of_both
-def test_the_default_holds_for_smoother_and_rougher_surfaces(
-    distribution: AbstractMicrofacet, integral: str
-) -> None:
+def test_the_default_holds_for_smoother_and_rougher_surfaces(distribution, integral) -> None:
     bound = 1e-3 if integral in ("sky", "exit") else 2e-3
     assert largest_error(distribution, FacetQuadrature(), integral, BEYOND) < bound
 

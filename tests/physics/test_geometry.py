@@ -69,9 +69,7 @@ def test_a_negative_zenith_is_the_other_side(view: float, light: float, differen
 
 @given(view=zenith, light=zenith, turn=azimuth, difference=azimuth)
 @settings(deadline=None, max_examples=60)
-def test_mirror_slopes_agree_with_vectors(
-    view: float, light: float, turn: float, difference: float
-) -> None:
+def test_mirror_slopes_agree_with_vectors(view, light, turn, difference) -> None:
     """Towards the viewer, and across along the viewer's s axis: relative to the facet's tilt."""
     half = twin.ray(view, turn) + twin.ray(light, turn + difference)
     s, second = twin.axes(view, turn)
@@ -89,9 +87,7 @@ def test_mirror_slopes_agree_with_vectors(
 @pytest.mark.thorough
 @given(view=zenith, light=zenith, turn=azimuth, difference=azimuth)
 @settings(deadline=None, max_examples=60)
-def test_turn_between_frames_agrees_with_vectors(
-    view: float, light: float, turn: float, difference: float
-) -> None:
+def test_turn_between_frames_agrees_with_vectors(view, light, turn, difference) -> None:
     """A mirror that treats s and p alike takes light's s axis to where the angle says."""
     ends = (view, turn), (light, turn + difference)
     geometry = at(view, light, difference, turn)

@@ -222,9 +222,7 @@ materials = st.tuples(st.floats(0.0, 20.0), st.floats(0.0, 1.0))
 
 @given(light=zenith, view=zenith, azimuth=turn, material=materials)
 @settings(deadline=None, max_examples=25)
-def test_viewer_and_light_may_change_places(
-    light: float, view: float, azimuth: float, material: tuple[float, float]
-) -> None:
+def test_viewer_and_light_may_change_places(light, view, azimuth, material) -> None:
     """Helmholtz, for every polarization: the matrix is transposed."""
     there = mueller(light, view, azimuth, *material)
     back = mueller(view, light, -azimuth, *material)
@@ -233,9 +231,7 @@ def test_viewer_and_light_may_change_places(
 
 @given(light=zenith, view=zenith, azimuth=turn, material=materials)
 @settings(deadline=None, max_examples=25)
-def test_the_other_side_of_the_plane_is_a_mirror_image(
-    light: float, view: float, azimuth: float, material: tuple[float, float]
-) -> None:
+def test_the_other_side_of_the_plane_is_a_mirror_image(light, view, azimuth, material) -> None:
     left, right = (mueller(light, view, side * azimuth, *material) for side in (1.0, -1.0))
     sign = np.diag([1.0, 1.0, -1.0])
     np.testing.assert_allclose(left, sign @ right @ sign, rtol=1e-9, atol=1e-11 * left[0, 0])
@@ -243,9 +239,7 @@ def test_the_other_side_of_the_plane_is_a_mirror_image(
 
 @given(light=zenith, view=zenith, azimuth=turn, absorption=st.floats(0.0, 20.0))
 @settings(deadline=None, max_examples=25)
-def test_without_rayleigh_scattering_inner_light_is_unpolarized(
-    light: float, view: float, azimuth: float, absorption: float
-) -> None:
+def test_without_rayleigh_scattering_inner_light_is_unpolarized(light, view, azimuth, absorption):
     found = mueller(light, view, azimuth, absorption, 0.0)
     np.testing.assert_allclose(found[1:], 0.0, atol=1e-15)
     np.testing.assert_array_equal(found[:, 2], 0.0)
@@ -253,9 +247,7 @@ def test_without_rayleigh_scattering_inner_light_is_unpolarized(
 
 @given(light=zenith, view=zenith, azimuth=turn, fraction=st.floats(0.0, 1.0))
 @settings(deadline=None, max_examples=25)
-def test_a_black_body_scatters_once(
-    light: float, view: float, azimuth: float, fraction: float
-) -> None:
+def test_a_black_body_scatters_once(light, view, azimuth, fraction) -> None:
     """Rayleigh's law from vectors: a dipole along the field, seen through two analyzers."""
 
     def frame(ray: Ray, turned: float) -> np.ndarray:

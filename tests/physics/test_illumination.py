@@ -66,9 +66,7 @@ def test_uniform_sky_agrees_with_the_renderer(code: int, distribution: Beckmann 
 
 @DISTRIBUTIONS
 @each("half_width", [1.0, 5.0, 15.0])
-def test_disc_agrees_with_the_renderer(
-    code: int, distribution: Beckmann | GGX, half_width: float
-) -> None:
+def test_disc_agrees_with_the_renderer(code, distribution, half_width) -> None:
     """Where the disc is above the horizon and not far wider than the slopes of the surface.
 
     The table is in single precision and loses light beyond: see the brute-force test below.

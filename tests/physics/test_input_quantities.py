@@ -23,10 +23,7 @@ from polar_bayes.physics.stokes import Light
 from polar_bayes.setups import SETUPS
 
 GEOMETRY = Geometry(
-    jnp.array([0.0, 30.0, 60.0]),
-    jnp.array([180.0, 180.0, 0.0]),
-    jnp.full(3, 40.0),
-    jnp.zeros(3),
+    jnp.array([0.0, 30.0, 60.0]), jnp.array([180.0, 180.0, 0.0]), jnp.full(3, 40.0), jnp.zeros(3)
 )
 LIGHT = Light(jnp.array([1.0, 0.5, 0.1]), jnp.array([0.2, 0.6, -0.3]), jnp.array([0.0, 0.1, 0.2]))
 

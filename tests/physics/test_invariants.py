@@ -11,7 +11,7 @@ from optics import BEAM, GROOVED, between_points, predict, stokes_of
 from optics import at as one_view
 from optics import directions as directions_of
 
-from polar_bayes.physics.coat import AbstractCoat, BackFace, ClearCoat, CoatStack, ThinFilm
+from polar_bayes.physics.coat import BackFace, ClearCoat, CoatStack, ThinFilm
 from polar_bayes.physics.dispersion import Cauchy, Sellmeier
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
@@ -30,7 +30,6 @@ from polar_bayes.physics.instrument import (
 )
 from polar_bayes.physics.microfacet import (
     GGX,
-    AbstractMicrofacet,
     AnisotropicSlopes,
     Beckmann,
     HeightCorrelatedShadowing,
@@ -148,9 +147,7 @@ def at(direction: tuple, turn: float = 0.0) -> Geometry:
 @every_scene
 @given(values=parameters, direction=directions)
 @RUN
-def test_no_light_is_more_than_polarized_or_less_than_dark(
-    name: str, values: dict, direction: tuple
-) -> None:
+def test_no_light_is_more_than_polarized_or_less_than_dark(name, values, direction) -> None:
     """S0 >= |S|, before the instrument."""
     s0, s1, s2 = np.asarray(stokes_of(SCENES[name], values, at(direction)))[0]
     assert s0 >= 0.0
@@ -160,9 +157,7 @@ def test_no_light_is_more_than_polarized_or_less_than_dark(
 @each("name", sorted(name for name, scene in SCENES.items() if scene.instrument), quick=1)
 @given(values=parameters, direction=directions)
 @RUN
-def test_no_reading_is_more_than_polarized_or_less_than_dark(
-    name: str, values: dict, direction: tuple
-) -> None:
+def test_no_reading_is_more_than_polarized_or_less_than_dark(name, values, direction) -> None:
     """Behind an instrument with all its terms, and another."""
     readings = predict(SCENES[name], values, at(direction))
     assert readings["intensity"] >= 0.0
@@ -239,9 +234,7 @@ def test_a_surface_reflects_no_more_than_it_gets(name: str) -> None:
 @each("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
 @each("coat", [None, ClearCoat(1.3, 0.2)], ids=["bare", "coated"])
 @each("light", [0.0, 40.0, 70.0])
-def test_a_nearly_smooth_surface_reflects_what_a_plane_does(
-    distribution: AbstractMicrofacet, coat: AbstractCoat | None, light: float
-) -> None:
+def test_a_nearly_smooth_surface_reflects_what_a_plane_does(distribution, coat, light) -> None:
     """To the square of the roughness; a long tail lets a part in 1,000 go elsewhere."""
     values = {"roughness": 0.003, "roughness_across": 0.003, "refractive_index": 1.5}
     rough = Scene(RoughSurface(distribution), coat=coat)
@@ -312,9 +305,7 @@ def no_mirror(values: dict) -> dict:
 @every_scene
 @given(values=parameters, direction=directions, turn=st.floats(-360.0, 360.0))
 @settings(parent=RUN, max_examples=30)
-def test_turning_sample_viewer_and_light_together_changes_nothing(
-    name: str, values: dict, direction: tuple, turn: float
-) -> None:
+def test_turning_sample_viewer_and_light_together_changes_nothing(name, values, direction, turn):
     """What it leaves of a narrow highlight's brightness is rounding of azimuths, over its width."""
     values = no_mirror(values)
     turned = values | {"roughness_azimuth": values["roughness_azimuth"] + turn}
@@ -342,9 +333,7 @@ def test_a_mirror_image_has_the_other_sign_of_u(name: str, values: dict, directi
 @pytest.mark.thorough
 @each("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
 @each("coat", [None, ThinFilm(1.38, 120.0)], ids=["bare", "filmed"])
-def test_a_smooth_surface_under_a_sky_obeys_fresnel(
-    distribution: AbstractMicrofacet, coat: AbstractCoat | None
-) -> None:
+def test_a_smooth_surface_under_a_sky_obeys_fresnel(distribution, coat) -> None:
     """As roughness goes to zero, grooves or not; the nodes of Beckmann's slopes lack 1.6e-4."""
     scene = Scene(RoughSurface(distribution, UniformSky(), slopes=GROOVED), coat=coat)
     zeniths = np.array([1.0, 30.0, 56.0, 75.0])

@@ -5,7 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import pytest
 from cases import each
-from optics import BEAM, GROOVED, directions
+from optics import BEAM, EVERYTHING, GROOVED, directions
 
 import polar_bayes as pb
 from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
@@ -32,7 +32,7 @@ from polar_bayes.physics.microfacet import (
     IsotropicSlopes,
     SeparableShadowing,
 )
-from polar_bayes.physics.mixing import DopMixing, StokesMixing
+from polar_bayes.physics.mixing import DopMixing
 from polar_bayes.physics.phase_function import HenyeyGreenstein
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, SCENES, Scene
 from polar_bayes.physics.second_bounce import TwoBounceSurface
@@ -65,14 +65,7 @@ READ = [
         "roughness subsurface_fraction refractive_index normal_tilt_x normal_tilt_y dolp_gain",
     ),
     (
-        Scene(  # the material's in their order, then the light, then the instrument
-            RoughSurface(GGX(), BEAM, slopes=GROOVED, way_out=RoughPassage()),
-            Lambertian("albedo"),
-            StokesMixing(),
-            CoatStack((FILM, LACQUER)),
-            Instrument((AngleZero(), BeamOverlap(), DolpGain())),
-            Cauchy(),
-        ),
+        EVERYTHING,  # the material's in their order, then the light, then the instrument
         "roughness subsurface_fraction roughness_across roughness_azimuth albedo cauchy_a cauchy_b "
         "coat_refractive_index coat_absorbance film_refractive_index film_thickness light_degree "
         "light_angle angle_zero beam_overlap_zenith dolp_gain",

@@ -245,9 +245,7 @@ a, g, index = st.floats(0.0, 20.0), st.floats(0.0, 0.9), st.floats(1.0, 2.5)
 
 @given(light=zenith, view=zenith, azimuth=turn, a=a, g=g, n=index)
 @settings(deadline=None, max_examples=50, derandomize=True)
-def test_viewer_and_light_may_change_places(
-    light: float, view: float, azimuth: float, a: float, g: float, n: float
-) -> None:
+def test_viewer_and_light_may_change_places(light, view, azimuth, a, g, n) -> None:
     there = through_a_plane(HenyeyGreenstein("g"), n, a, light, view, azimuth, g=g)
     back = through_a_plane(HenyeyGreenstein("g"), n, a, view, light, -azimuth, g=g)
     assert there > 0.0
@@ -256,9 +254,7 @@ def test_viewer_and_light_may_change_places(
 
 @given(light=zenith, view=zenith, azimuth=turn, a=a, n=index)
 @settings(deadline=None, max_examples=50, derandomize=True)
-def test_without_anisotropy_scattering_is_isotropic(
-    light: float, view: float, azimuth: float, a: float, n: float
-) -> None:
+def test_without_anisotropy_scattering_is_isotropic(light, view, azimuth, a, n) -> None:
     found, expected = (
         through_a_plane(each, n, a, light, view, azimuth)
         for each in (HenyeyGreenstein(0.0), Isotropic())

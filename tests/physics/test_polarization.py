@@ -48,9 +48,7 @@ def mirrored(
 @example(view=(40.0, 30.0), light=(40.0, 210.0), n=1.5, degree=1.0, angle=20.0)
 @example(view=(0.0, 30.0), light=(60.0, 10.0), n=1.5, degree=1.0, angle=-70.0)
 @example(view=(60.0, 30.0), light=(0.0, 10.0), n=1.5, degree=0.5, angle=100.0)
-def test_a_facet_turns_the_field_as_vectors_do(
-    view: tuple, light: tuple, n: float, degree: float, angle: float
-) -> None:
+def test_a_facet_turns_the_field_as_vectors_do(view, light, n, degree, angle) -> None:
     """Fresnel's amplitudes along explicit axes: all three components, in and out of the plane."""
     powers = twin.bare(n, twin.facet_of(view, light)[0])
     expected = twin.mirrored(powers, view, light, components(degree, angle))
@@ -65,9 +63,7 @@ FILM, COAT = (1.38, 230.0), (1.7, 0.3)
 @pytest.mark.thorough
 @given(view=direction, light=direction, degree=degree, angle=angle)
 @RUN
-def test_a_facet_under_a_film_or_coat_does_so_too(
-    view: tuple, light: tuple, degree: float, angle: float
-) -> None:
+def test_a_facet_under_a_film_or_coat_does_so_too(view, light, degree, angle) -> None:
     b, _ = twin.facet_of(view, light)
     film = twin.powers(twin.films(1.0, ((FILM[0], 2.0 * np.pi * FILM[1] / 550.0),), 1.5, b)[0])
     coat = tuple(twin.bounced((1.0, COAT[0], 1.5), COAT[1:], b, bounces=60)[0])
@@ -80,9 +76,7 @@ def test_a_facet_under_a_film_or_coat_does_so_too(
 
 @given(view=direction, light=direction, n=index, angle=angle)
 @RUN
-def test_degree_0_and_orthogonal_pairs_are_unpolarized_light(
-    view: tuple, light: tuple, n: float, angle: float
-) -> None:
+def test_degree_0_and_orthogonal_pairs_are_unpolarized_light(view, light, n, angle) -> None:
     for surface, beam in (
         (SmoothSurface(), SmoothSurface(BEAM)),
         (RoughSurface(), RoughSurface(illumination=BEAM)),
@@ -120,9 +114,7 @@ def test_derivatives_exist_where_viewer_and_light_coincide(view: tuple, dtype: t
 @pytest.mark.thorough
 @given(incidence=zenith, n=index, degree=degree, angle=angle)
 @RUN
-def test_what_enters_is_what_the_transmittances_of_s_and_p_let_through(
-    incidence: float, n: float, degree: float, angle: float
-) -> None:
+def test_what_enters_is_what_the_transmittances_of_s_and_p_let_through(incidence, n, degree, angle):
     b = float(np.sin(np.deg2rad(incidence)) ** 2)
     _, fields, (s, p) = twin.films(1.0, (), n, b)
     # The product of both fields grows in power as each does.

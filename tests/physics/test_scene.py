@@ -8,17 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import each
-from optics import BEAM, GROOVED, directions, predict, stokes_of
+from optics import BEAM, EVERYTHING, directions, predict, stokes_of
 
 from polar_bayes.errors import SceneError
-from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
-from polar_bayes.physics.dispersion import Cauchy
+from polar_bayes.physics.coat import ClearCoat
 from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
 from polar_bayes.physics.instrument import (
     AbstractInstrumentTerm,
     Analyzer,
-    AngleZero,
-    BeamOverlap,
     DarkLevel,
     Discrepancy,
     DolpGain,
@@ -29,7 +26,7 @@ from polar_bayes.physics.microfacet import GGX, Beckmann
 from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import SCENES, Scene
 from polar_bayes.physics.subsurface import Depolarizer, Lambertian
-from polar_bayes.physics.surface import RoughPassage, RoughSurface, SmoothExit, SmoothSurface
+from polar_bayes.physics.surface import RoughSurface, SmoothExit, SmoothSurface
 
 VIEWS = directions([0.0, 45.0, 80.0], 180.0, 45.0)
 PARAMETERS = {
@@ -56,14 +53,6 @@ LEANING = Scene(
     Lambertian(),
     StokesMixing(),
     normal=TiltedNormal(),
-)
-EVERYTHING = Scene(
-    RoughSurface(GGX(), BEAM, slopes=GROOVED, way_out=RoughPassage()),
-    Lambertian("albedo"),
-    StokesMixing(),
-    CoatStack((ThinFilm(), ClearCoat())),
-    Instrument((AngleZero(), BeamOverlap(), DolpGain())),
-    Cauchy(),
 )
 EVERY_SCENE = SCENES | {"leaning": LEANING}
 

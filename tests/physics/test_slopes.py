@@ -11,11 +11,7 @@ from optics import DISTRIBUTIONS, GROOVED, directions, stokes_of
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
-from polar_bayes.physics.microfacet import (
-    GGX,
-    HeightCorrelatedShadowing,
-    IsotropicSlopes,
-)
+from polar_bayes.physics.microfacet import GGX, HeightCorrelatedShadowing, IsotropicSlopes
 from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.stack import Stack
@@ -71,9 +67,7 @@ def test_equal_roughnesses_are_isotropic(source: object, name: str) -> None:
 
 
 @SOURCES
-def test_turned_grooves_have_the_other_roughness_and_mirrored_ones_the_other_sign_of_u(
-    source: object,
-) -> None:
+def test_turned_grooves_have_the_other_roughness_and_mirrored_ones_the_other_sign_of_u(source):
     found = scene(source, GROOVED)
     here = stokes_of(found, material(0.4, 0.15, 25.0), seen())
     turned = stokes_of(found, material(0.15, 0.4, 115.0), seen())

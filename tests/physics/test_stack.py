@@ -139,9 +139,7 @@ def escape_by_brute_force(indexes: list, absorbances: list) -> float:
 
 @each("absorbance", [0.0, 1e-3, 0.3, 50.0])
 @each(("coat", "body"), [(1.3, 1.5), (1.7, 1.5), (1.5, 1.5), (1.01, 1.5), (1.5, 1.01), (1.3, 2.4)])
-def test_escape_through_a_coat_agrees_with_brute_force(
-    coat: float, body: float, absorbance: float
-) -> None:
+def test_escape_through_a_coat_agrees_with_brute_force(coat, body, absorbance) -> None:
     """24 nodes over angles that reach the air and 24 over those that reach the coat.
 
     Hard are nearly clear coats, in which light is absorbed on a long slant only: over absorbances

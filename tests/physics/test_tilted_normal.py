@@ -115,9 +115,7 @@ def rotated(scene: Scene, view: tuple, light: tuple, tilts: tuple) -> np.ndarray
 @example(view=(50.0, 70.0), light=(0.0, 0.0), tilts=(3.0, -4.0))
 @example(view=(50.0, 70.0), light=(50.0, 70.0), tilts=(3.0, -4.0))
 @example(view=(75.0, 0.0), light=(75.0, 180.0), tilts=(0.0, 30.0))
-def test_a_leaning_normal_is_light_and_viewer_rotated_the_other_way(
-    name: str, view: tuple, light: tuple, tilts: tuple
-) -> None:
+def test_a_leaning_normal_is_light_and_viewer_rotated_the_other_way(name, view, light, tilts):
     """All three components in the frame of a detector that stays, each with its sign."""
     turn = rotation(tilts)
     if min((turn.T @ twin.ray(*one))[2] for one in (view, light)) < 0.05:
@@ -131,9 +129,7 @@ def test_a_leaning_normal_is_light_and_viewer_rotated_the_other_way(
 
 @given(view=direction, light=direction, tilts=tilt)
 @RUN
-def test_a_mirror_facet_does_not_care_where_the_normal_is(
-    view: tuple, light: tuple, tilts: tuple
-) -> None:
+def test_a_mirror_facet_does_not_care_where_the_normal_is(view, light, tilts) -> None:
     """A plate sends what its one facet sends: only the frames lean, and they are turned back."""
     turn = rotation(tilts)
     if min((turn.T @ twin.ray(*one))[2] for one in (view, light)) < 0.05:

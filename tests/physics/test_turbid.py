@@ -8,11 +8,7 @@ from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
 from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.subsurface import TurbidMedium
-from polar_bayes.physics.surface import (
-    AbstractSurface,
-    RoughSurface,
-    SmoothSurface,
-)
+from polar_bayes.physics.surface import AbstractSurface, RoughSurface, SmoothSurface
 
 BODY = {"subsurface_fraction": 1.0, "absorption": 0.3, "refractive_index": 1.5, "roughness": 0.2}
 VIEWS = directions([0.0, 30.0, 60.0, 60.0, 85.0], [180.0, 180.0, 180.0, 60.0, 0.0], 40.0)
