@@ -7,6 +7,7 @@ import vector_optics as twin
 from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from optics import directions
 
 from polar_bayes.physics.geometry import (
     Geometry,
@@ -27,9 +28,7 @@ def at(view: float, light: float, difference: float, turn: float = 0.0) -> Geome
 
 
 def test_angles_broadcast_to_one_shape_and_one_float() -> None:
-    geometry = Geometry.from_degrees(
-        view_zenith=np.array([10, 20, 30]), view_azimuth=180, light_zenith=[45.0], light_azimuth=0
-    )
+    geometry = directions(np.array([10, 20, 30]), 180, [45.0], 0)
     assert all(angle.shape == (3,) for angle in geometry[:4])
     assert all(angle.dtype == jnp.float64 for angle in geometry[:4])
     assert geometry.wavelength is None
@@ -37,16 +36,12 @@ def test_angles_broadcast_to_one_shape_and_one_float() -> None:
 
 def test_single_precision_stays_single() -> None:
     angle = np.float32([10.0, 20.0])
-    geometry = Geometry.from_degrees(
-        view_zenith=angle, view_azimuth=angle, light_zenith=angle, light_azimuth=angle
-    )
+    geometry = directions(angle, angle, angle, angle)
     assert all(one.dtype == jnp.float32 for one in geometry[:4])
 
 
 def test_on_the_normal_the_frame_comes_from_the_light() -> None:
-    geometry = Geometry.from_degrees(
-        view_zenith=[0.0, 10.0], view_azimuth=77.0, light_zenith=30.0, light_azimuth=20.0
-    )
+    geometry = directions([0.0, 10.0], 77.0, 30.0, 20.0)
     np.testing.assert_array_equal(geometry.view_azimuth, [200.0, 77.0])
 
 
@@ -102,11 +97,11 @@ def test_turn_between_frames_agrees_with_vectors(view, light, turn, difference) 
 @pytest.mark.thorough
 def test_the_wavelength_travels_with_the_directions() -> None:
     colors = [[450.0], [650.0]]
-    geometry = Geometry.from_degrees(
-        view_zenith=np.float32([10.0, 20.0]),
-        view_azimuth=np.float32(180.0),
-        light_zenith=np.float32(30.0),
-        light_azimuth=np.float32(0.0),
+    geometry = directions(
+        np.float32([10.0, 20.0]),
+        np.float32(180.0),
+        np.float32(30.0),
+        np.float32(0.0),
         wavelength=colors,
     )
     assert geometry.wavelength.shape == (2, 1)
@@ -118,9 +113,7 @@ def test_the_wavelength_travels_with_the_directions() -> None:
 
 
 def test_reversed_is_light_and_viewer_in_each_others_place() -> None:
-    geometry = Geometry.from_degrees(
-        view_zenith=10.0, view_azimuth=20.0, light_zenith=30.0, light_azimuth=40.0
-    )
+    geometry = directions(10.0, 20.0, 30.0, 40.0)
     back = geometry.reversed()
     assert [float(angle[0]) for angle in back[:4]] == [30.0, 40.0, 10.0, 20.0]
     assert back.wavelength is None

@@ -129,7 +129,9 @@ def test_a_leaning_normal_is_light_and_viewer_rotated_the_other_way(name, view, 
 
 @given(view=direction, light=direction, tilts=tilt)
 @RUN
-def test_a_mirror_facet_does_not_care_where_the_normal_is(view, light, tilts) -> None:
+def test_a_mirror_facet_does_not_care_where_the_normal_is(
+    view: tuple, light: tuple, tilts: tuple
+) -> None:
     """A plate sends what its one facet sends: only the frames lean, and they are turned back."""
     turn = rotation(tilts)
     if min((turn.T @ twin.ray(*one))[2] for one in (view, light)) < 0.05:

@@ -167,12 +167,12 @@ def test_a_pixel_scatters_like_a_capture_of_its_truth():
 @pytest.mark.thorough
 def test_one_exposure_serves_the_whole_image():
     given = {"scene": PLATE, "protocol": GRAY, "links": LINKS}
+    given["parameters"] = {"refractive_index": INDEX, "subsurface_fraction": FRACTION}
     noise = {"intensity_scale": 1e-12}
-    parameters = {"refractive_index": INDEX, "subsurface_fraction": FRACTION}
-    capture = simulate("glass", parameters=parameters, noise=noise, **given)
+    capture = simulate("glass", noise=noise, **given)
     # The brightest tenth may be cut off at full scale; the quantile below it is not.
     assert float(capture["intensity"].quantile(0.9)) == pytest.approx(0.6, rel=1e-9)
-    known = simulate("glass", parameters=parameters, noise={**noise, "exposure": 1e-3}, **given)
+    known = simulate("glass", noise={**noise, "exposure": 1e-3}, **given)
     ratio = (capture["intensity"] / known["intensity"]).where(~capture["saturated"])
     np.testing.assert_allclose(ratio.min(), ratio.max(), rtol=1e-6)
 
