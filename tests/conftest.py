@@ -12,6 +12,7 @@ from pathlib import Path
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")  # before JAX is imported
 
 import jax
+import mpmath
 import pytest
 from pages import blank_pictures
 
@@ -47,6 +48,13 @@ def without_comparisons() -> Iterator[None]:
     alone = functools.partial(fit_request, with_comparisons=False)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("polar_bayes.scenes.fitting.fit_request", alone)
+        yield
+
+
+@pytest.fixture
+def fifty_digits() -> Iterator[None]:
+    """Numbers of mpmath have them."""
+    with mpmath.workdps(50):
         yield
 
 

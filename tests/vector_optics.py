@@ -18,6 +18,12 @@ def ray(zenith: float, azimuth: float) -> np.ndarray:
     return np.array([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
 
 
+def angles(vector: np.ndarray) -> tuple[float, float]:
+    """Zenith and azimuth of a vector, in degrees."""
+    x, y, z = vector
+    return float(np.rad2deg(np.arctan2(np.hypot(x, y), z))), float(np.rad2deg(np.arctan2(y, x)))
+
+
 def axes(zenith: float, azimuth: float) -> np.ndarray:
     """Both axes of a ray, as rows; on the normal they are the limit along the azimuth."""
     phi = np.deg2rad(azimuth)
@@ -75,7 +81,7 @@ def films(above, layers, below, sin_squared):
     `layers` are (index, 2 pi thickness/wavelength) from the top down; none for a bare boundary.
     """
     first, last = admittances(above, sin_squared), admittances(below, sin_squared)
-    electric, magnetic = np.ones(2, complex), last.astype(complex)
+    electric, magnetic = np.ones_like(last), last
     for index, wavenumber in reversed(layers):
         y = admittances(index, sin_squared)
         delta = wavenumber * index * cosine(index, sin_squared)
@@ -208,9 +214,7 @@ class Population:
         shown = self.share * np.maximum(cosine_, 0.0) / self.normal[:, 2]
         light = 2.0 * cosine_[:, None] * self.normal - towards
         b = 1.0 - cosine_**2
-        inside = np.sqrt(1.0 - b / index**2)
-        r_s = ((cosine_ - index * inside) / (cosine_ + index * inside)) ** 2
-        r_p = ((index * cosine_ - inside) / (index * cosine_ + inside)) ** 2
+        r_s, r_p, _ = bare(index, b)
         axis = np.cross(self.normal, towards)
         axis /= np.maximum(np.linalg.norm(axis, axis=-1, keepdims=True), 1e-300)
         first, other = axis @ s, axis @ second

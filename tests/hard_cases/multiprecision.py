@@ -7,8 +7,6 @@ from typing import NamedTuple
 
 import mpmath as mp
 
-DIGITS = 50
-
 # The floors of the package, which are part of its definition.
 SMOOTHEST = mp.mpf(1e-5)
 CLEAREST = mp.mpf(1e-4)

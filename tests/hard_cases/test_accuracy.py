@@ -2,13 +2,16 @@
 
 import itertools
 
+import jax
 import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
 from cases import each
+from digits import BOUND, assert_accurate, digitwise, exactly, grid
 from hard_cases import multiprecision as twin
 from hard_cases.catalogue import MATERIALS, WAVELENGTH, Material, every_case
+from optics import light_of, one_by_one, stokes_of
 
 from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
 from polar_bayes.physics.dispersion import Cauchy, Sellmeier
@@ -31,36 +34,17 @@ from polar_bayes.physics.stokes import Light, LinearPolarization
 from polar_bayes.physics.subsurface import Lambertian, body_loss, half_space_loss
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
 
-BOUND = {np.float64: 1e-10, np.float32: 1e-4}
 PRECISIONS = each("dtype", [np.float64, np.float32], quick=1)
 
+pytestmark = pytest.mark.usefixtures("fifty_digits")
 
-@pytest.fixture(autouse=True)
-def fifty_digits() -> object:
-    with mp.workdps(twin.DIGITS):
-        yield
-
-
-def relative_error(value: object, truth: list, floor: float = 1e-60) -> np.ndarray:
-    """|value - truth| / max(|truth|, floor), in 50 digits; 0/0 counts as no error."""
-    errors = []
-    for one, true in zip(np.asarray(value).ravel().tolist(), truth, strict=True):
-        gap, size = abs(mp.mpf(one) - true), max(abs(true), mp.mpf(floor))
-        errors.append(float(gap / size) if gap else 0.0)
-    return np.array(errors)
-
-
-def assert_accurate(value, truth, dtype, names, floor=1e-60):
-    assert np.asarray(value).dtype == dtype
-    error = relative_error(value, truth, floor)
-    worst = int(np.argmax(error))
-    assert error[worst] <= BOUND[dtype], f"{error[worst]:.1e} at {names[worst]}"
+reflect, transmit = jax.jit(Stack.reflection), jax.jit(Stack.transmission)
 
 
 def unique_directions(dtype: type) -> tuple[list[str], np.ndarray]:
     cases = every_case(dtype, exact=True)
-    first = [i for i, name in enumerate(cases.names) if name.endswith("/ ordinary")]
-    return [cases.names[i] for i in first], cases.directions[first]
+    first = [name.endswith("/ ordinary") for name in cases.names]
+    return list(itertools.compress(cases.names, first)), cases.directions[first]
 
 
 def geometry_of(directions: np.ndarray) -> Geometry:
@@ -70,63 +54,52 @@ def geometry_of(directions: np.ndarray) -> Geometry:
 
 @PRECISIONS
 def test_fresnel(dtype: type) -> None:
-    angles = np.array(
-        [0.0, 1e-6, 0.01, 1.0, 30.0, 56.3, 56.309932474020215, 60.0, 80.0, 89.0, 89.99], dtype
+    angle, index = grid(
+        dtype,
+        [0.0, 1e-6, 0.01, 1.0, 30.0, 56.3, 56.309932474020215, 60.0, 80.0, 89.0, 89.99],
+        [1.0, 1.0 + 1e-6, 1.0001, 1.01, 1.2, 1.33, 1.5, 2.0, 2.42],
     )
-    indices = np.array([1.0, 1.0 + 1e-6, 1.0001, 1.01, 1.2, 1.33, 1.5, 2.0, 2.42], dtype)
-    angle, index = (grid.ravel() for grid in np.meshgrid(angles, indices))
-    names = [f"{a} degrees, n = {n}" for a, n in zip(angle, index, strict=True)]
-    truth = [
-        twin.interface(twin.cosine(a), mp.mpf(float(n))) for a, n in zip(angle, index, strict=True)
-    ]
+    truth = map(twin.interface, digitwise(twin.cosine)(angle), exactly(index))
+    truth = twin.Interface(*np.array(list(truth), object).T)
     c, b = cos_degrees(angle), sin_degrees(angle) ** 2
     stack = Stack(jnp.asarray(index))
     power, relative = stack.reflection(c, b), stack.relative_reflection(c, b)
     passing = stack.transmission(c, b)
-    for value, field in (
-        (power.mean, "mean"),
-        (power.contrast * b, "difference"),
-        (stack.scale * relative.mean, "mean"),
-        (stack.scale * relative.contrast * b, "difference"),
-        (passing.mean, "transmitted"),
-        (relative.contrast * b / relative.mean, "reflected_polarization"),
-        (-passing.contrast * b / passing.mean, "exit_polarization"),
+    for value, true in (
+        (power.mean, truth.mean),
+        (power.contrast * b, truth.difference),
+        (stack.scale * relative.mean, truth.mean),
+        (stack.scale * relative.contrast * b, truth.difference),
+        (passing.mean, truth.transmitted),
+        (relative.contrast * b / relative.mean, truth.reflected_polarization),
+        (-passing.contrast * b / passing.mean, truth.exit_polarization),
     ):
-        assert_accurate(value, [getattr(one, field) for one in truth], dtype, names)
+        assert_accurate(value, true, dtype, angle, index)
 
 
 @PRECISIONS
 def test_hemisphere(dtype: type) -> None:
     """Slopes and curvatures are tested with Fresnel."""
-    indices = np.array([1.0, 1.0 + 1e-6, 1.001, 1.2, 1.33, 1.5, 2.0, 2.42], dtype)
-    names = [f"n = {n}" for n in indices]
-    truth = [1 - twin.hemispherical_reflection(mp.mpf(float(n))) for n in indices]
-    leaving = [passed / mp.mpf(float(n)) ** 2 for passed, n in zip(truth, indices, strict=True)]
-    stack = Stack(jnp.asarray(indices))
-    assert_accurate(stack.hemispherical_transmission(), truth, dtype, names)
-    assert_accurate(stack.escape(), leaving, dtype, names)
+    index = np.array([1.0, 1.0 + 1e-6, 1.001, 1.2, 1.33, 1.5, 2.0, 2.42], dtype)
+    truth = 1 - digitwise(twin.hemispherical_reflection)(exactly(index))
+    stack = Stack(jnp.asarray(index))
+    assert_accurate(stack.hemispherical_transmission(), truth, dtype, index)
+    assert_accurate(stack.escape(), truth / exactly(index) ** 2, dtype, index)
 
 
 @PRECISIONS
 def test_mirror_facet(dtype: type) -> None:
     """The turn of the s axis is measured against the squared sine: it passes through zero."""
     names, directions = unique_directions(dtype)
-    truth = [twin.facet(*direction) for direction in directions]
+    truth = twin.Facet(*np.array([twin.facet(*each) for each in directions], object).T)
     found = mirror_facet(geometry_of(directions))
-    for field in ("cos_incidence", "sin_squared"):
-        assert_accurate(getattr(found, field), [getattr(one, field) for one in truth], dtype, names)
     # A facet without tilt is known to the rounding of the zenith angles, 1e-16 or 1e-7, squared.
     floor = 1e-30 if dtype == np.float64 else 1e-12
-    tilt = [one.tan_squared_tilt for one in truth]
-    assert_accurate(found.tan_squared_tilt, tilt, dtype, names, floor)
-    for field in ("along_s", "across_s"):
-        error = [
-            abs(mp.mpf(value) - getattr(one, field)) / one.sin_squared if one.sin_squared else 0
-            for value, one in zip(
-                np.asarray(getattr(found, field)).ravel().tolist(), truth, strict=True
-            )
-        ]
-        assert max(error) <= BOUND[dtype], names[int(np.argmax(error))]
+    assert_accurate(found.cos_incidence, truth.cos_incidence, dtype, names)
+    assert_accurate(found.sin_squared, truth.sin_squared, dtype, names)
+    assert_accurate(found.tan_squared_tilt, truth.tan_squared_tilt, dtype, names, floor=floor)
+    assert_accurate(found.along_s, truth.along_s, dtype, names, size=truth.sin_squared)
+    assert_accurate(found.across_s, truth.across_s, dtype, names, size=truth.sin_squared)
 
 
 @PRECISIONS
@@ -167,107 +140,103 @@ def test_lean(dtype: type) -> None:
 @each("distribution", [Beckmann(), GGX()])
 def test_distribution(distribution: Beckmann | GGX, dtype: type) -> None:
     """Where the density is within 1e-30 of its peak; below, Beckmann's stops falling."""
-    kind = type(distribution).__name__.lower()
-    tan_squared = np.array([0.0, 1e-12, 1e-6, 1e-3, 0.01, 0.1, 1.0, 10.0, 1e4, 3e9], dtype)
-    roughness = np.array([0.0, 1e-5, 1e-3, 0.02, 0.1, 0.3, 1.0, 3.0], dtype)
-    tan_squared, roughness = (g.ravel() for g in np.meshgrid(tan_squared, roughness))
-    names = [f"tan^2 {t}, r {r}" for t, r in zip(tan_squared, roughness, strict=True)]
-    pairs = [
-        (mp.mpf(float(t)), mp.mpf(float(r))) for t, r in zip(tan_squared, roughness, strict=True)
-    ]
-    density = [getattr(twin, f"{kind}_density")(*pair) for pair in pairs]
-    peak = [getattr(twin, f"{kind}_density")(mp.mpf(0), pair[1]) for pair in pairs]
-    error = relative_error(distribution.density(tan_squared, roughness), density)
-    bright = np.array([d > p * mp.mpf("1e-30") for d, p in zip(density, peak, strict=True)])
-    assert np.max(error[bright]) <= BOUND[dtype], names[int(np.argmax(error * bright))]
-    shadowing = [getattr(twin, f"{kind}_shadowing")(*pair) for pair in pairs]
-    assert_accurate(distribution.shadowing(tan_squared, roughness), shadowing, dtype, names)
+    exact_density, exact_shadowing = TWINS[distribution]
+    slope, roughness = grid(
+        dtype,
+        [0.0, 1e-12, 1e-6, 1e-3, 0.01, 0.1, 1.0, 10.0, 1e4, 3e9],
+        [0.0, 1e-5, 1e-3, 0.02, 0.1, 0.3, 1.0, 3.0],
+    )
+    pairs = exactly(slope), exactly(roughness)
+    density, peak = exact_density(*pairs), exact_density(mp.mpf(0), pairs[1])
+    bright = density > peak * mp.mpf("1e-30")
+    found = np.asarray(distribution.density(slope, roughness))[bright]
+    assert_accurate(found, density[bright], dtype, slope[bright], roughness[bright])
+    shadowing = distribution.shadowing(slope, roughness)
+    assert_accurate(shadowing, exact_shadowing(*pairs), dtype, slope, roughness)
+
+
+TWINS = {
+    Beckmann(): (digitwise(twin.beckmann_density), digitwise(twin.beckmann_shadowing)),
+    GGX(): (digitwise(twin.ggx_density), digitwise(twin.ggx_shadowing)),
+}
 
 
 @PRECISIONS
 def test_body(dtype: type) -> None:
     absorption = np.array([0.0, 1e-4, 1e-3, 0.1, 1.0, 10.0, 1e3, 1e6], dtype)
-    index = np.full_like(absorption, 1.5)
-    names = [f"a = {a}" for a in absorption]
-    albedo = [twin.half_space_albedo(mp.mpf(float(a))) for a in absorption]
-    escape = Stack(jnp.asarray(index)).escape()
+    albedo = digitwise(twin.half_space_albedo)(exactly(absorption))
+    escape = Stack(jnp.full_like(absorption, 1.5)).escape()
     inside = 1 - mp.mpf(float(escape[0]))
-    behind = [(1 - inside) * rd / (1 - inside * rd) for rd in albedo]
-    assert_accurate(half_space_loss(absorption), [1 - rd for rd in albedo], dtype, names)
+    behind = (1 - inside) * albedo / (1 - inside * albedo)
+    assert_accurate(half_space_loss(absorption), 1 - albedo, dtype, absorption)
     # The floor of absorption is rounded to the precision before its square root is taken.
-    assert_accurate(
-        body_loss(absorption, Stack(jnp.asarray(index)).escape()),
-        [1 - rb for rb in behind],
-        dtype,
-        names,
-    )
+    assert_accurate(body_loss(absorption, escape), 1 - behind, dtype, absorption)
+
+
+def mirrored_light(direction: np.ndarray, n: mp.mpf) -> tuple:
+    """The facet between the directions; reflectance, q and u of what it mirrors."""
+    facet = twin.facet(*direction)
+    mirror = twin.interface(facet.cos_incidence, n)
+    per_sine = mirror.reflected_polarization / facet.sin_squared if facet.sin_squared else 0
+    return facet, (mirror.mean, per_sine * facet.along_s, -per_sine * facet.across_s)
 
 
 def surface_truth(direction: np.ndarray, n: mp.mpf, roughness: mp.mpf) -> tuple:
     """Intensity, q and u of a Beckmann surface under a point source."""
-    facet = twin.facet(*direction)
-    fresnel_ = twin.interface(facet.cos_incidence, n)
-    slopes = [(twin.sine(z) / twin.cosine(z)) ** 2 for z in direction[:2]]
+    facet, (mean, q, u) = mirrored_light(direction, n)
     shown = twin.beckmann_density(facet.tan_squared_tilt, roughness)
-    for slope in slopes:
-        shown *= twin.beckmann_shadowing(slope, roughness)
-    shown /= 4 * twin.cosine(direction[0])
-    per_sine = fresnel_.reflected_polarization / facet.sin_squared if facet.sin_squared else 0
-    return shown * fresnel_.mean, per_sine * facet.along_s, -per_sine * facet.across_s
+    for zenith in direction[:2]:
+        shown *= twin.beckmann_shadowing((twin.sine(zenith) / twin.cosine(zenith)) ** 2, roughness)
+    return shown * mean / (4 * twin.cosine(direction[0])), q, u
 
 
 @PRECISIONS
 def test_scene_of_a_rough_surface(dtype: type) -> None:
     """Intensity against its own size, q and u against the degree of polarization."""
-    cases = every_case(dtype, exact=True)
-    parameters = dict(zip(Material._fields, cases.materials.T, strict=True))
-    light = Scene(RoughSurface(Beckmann())).light(parameters, geometry_of(cases.directions))
-    for i, name in enumerate(cases.names):
-        roughness, _, _, n = (mp.mpf(float(value)) for value in cases.materials[i])
-        intensity, q, u = surface_truth(cases.directions[i], n, roughness)
-        length = mp.sqrt(q**2 + u**2)
-        for value, true in ((light.q[i, 0], q), (light.u[i, 0], u)):
-            assert abs(mp.mpf(float(value)) - true) <= BOUND[dtype] * length, name
-        # A highlight 1e-5 wide and 1e-30 of its peak bright is darker than any reading, and its
-        # slope is squared before it is divided by the width.
-        peak = twin.beckmann_density(mp.mpf(0), roughness)
-        if intensity > mp.mpf("1e-25") * peak and (dtype == np.float64 or roughness >= 1e-3):
-            error = abs(mp.mpf(float(light.intensity[i, 0])) - intensity)
-            assert error <= BOUND[dtype] * intensity, name
+    names, directions, materials = every_case(dtype, exact=True)
+    parameters = dict(zip(Material._fields, materials.T, strict=True))
+    light = light_of(Scene(RoughSurface(Beckmann())), parameters, geometry_of(directions))
+    roughness, _, _, n = exactly(materials.T)
+    truth = list(map(surface_truth, directions, n, roughness))
+    intensity, q, u = np.array(truth, object).T
+    length = digitwise(mp.hypot)(q, u)
+    assert_accurate(light.q, q, dtype, names, size=length)
+    assert_accurate(light.u, u, dtype, names, size=length)
+    # A highlight 1e-5 wide and 1e-30 of its peak bright is darker than any reading, and its
+    # slope is squared before it is divided by the width.
+    lit = intensity > TWINS[Beckmann()][0](mp.mpf(0), roughness) * mp.mpf("1e-25")
+    lit &= (dtype == np.float64) | (roughness >= 1e-3)
+    assert_accurate(light.intensity[lit], intensity[lit], dtype, np.array(names)[lit])
 
 
 @PRECISIONS
 @each("mixing", [StokesMixing(), DopMixing(), DopMixing(signed=True)], quick=1)
 def test_scene_of_a_plate_over_a_diffuse_body(mixing, dtype):
     """q and u against the degree of polarization of the stronger part."""
-    cases = every_case(dtype, exact=True)
-    keep = [i for i, name in enumerate(cases.names) if cases.materials[i, 0] == dtype(0.1)]
-    directions, materials = cases.directions[keep], cases.materials[keep]
+    names, directions, materials = every_case(dtype, exact=True)
+    keep = materials[:, 0] == dtype(0.1)
+    directions, materials = directions[keep], materials[keep]
     scene = Scene(SmoothSurface(), Lambertian(albedo=0.5), mixing)
     parameters = dict(zip(Material._fields, materials.T, strict=True))
-    light = scene.light(parameters, geometry_of(directions))
-    for i, (direction, material) in enumerate(zip(directions, materials, strict=True)):
-        _, b, _, n = (mp.mpf(float(value)) for value in material)
-        facet = twin.facet(*direction)
-        mirror = twin.interface(facet.cos_incidence, n)
-        per_sine = mirror.reflected_polarization / facet.sin_squared if facet.sin_squared else 0
-        first = mirror.mean, per_sine * facet.along_s, -per_sine * facet.across_s
-        cos_view, cos_light = twin.cosine(direction[0]), twin.cosine(direction[1])
+    light = light_of(scene, parameters, geometry_of(directions))
+    truth = []
+    for direction, (_, b, _, n) in zip(directions, exactly(materials), strict=True):
+        _, first = mirrored_light(direction, n)
+        cos_view, cos_light = map(twin.cosine, direction[:2])
         out, into = twin.interface(cos_view, n), twin.interface(cos_light, n)
         brightness = cos_light * into.transmitted * out.transmitted / (2 * mp.pi)
         second = brightness, -out.exit_polarization, mp.mpf(0)
-        intensity, q, u = mixed(mixing, b, first, second)
-        size = max(mp.hypot(first[1], first[2]), abs(second[1]))
         # The tip of the degree of polarization is rounded off at 1e-12; and a trace of the other
         # part, eps^1.25, moves the share where a fraction comes close to that trace.
         trace = float(np.finfo(dtype).eps) ** 1.25 / max(min(b, 1 - b), mp.mpf("1e-30"))
+        size = max(mp.hypot(first[1], first[2]), abs(second[1]))
         slack = (BOUND[dtype] + (trace if 0 < b < 1 else 0)) * size + mp.mpf("2e-12")
-        name = cases.names[keep[i]]
-        assert abs(mp.mpf(float(light.q[i, 0])) - q) <= slack, name
-        assert abs(mp.mpf(float(light.u[i, 0])) - u) <= slack, name
-        assert abs(mp.mpf(float(light.intensity[i, 0])) - intensity) <= (
-            BOUND[dtype] * intensity
-        ), name
+        truth.append((*mixed(mixing, b, first, second), slack))
+    intensity, q, u, slack = np.array(truth, object).T
+    named = list(itertools.compress(names, keep))
+    assert_accurate(light.q, q, dtype, named, size=slack, bound=1.0)
+    assert_accurate(light.u, u, dtype, named, size=slack, bound=1.0)
+    assert_accurate(light.intensity, intensity, dtype, named)
 
 
 def mixed(mixing: StokesMixing | DopMixing, b: mp.mpf, first: tuple, second: tuple) -> tuple:
@@ -326,8 +295,8 @@ def test_layers(dtype: type) -> None:
         film, wavenumber, coat, absorbance, n = (jnp.asarray(dtype(x)) for x in case)
         layers = (Layer(film, wavenumber=2.0 * wavenumber), Layer(coat, absorbance))
         stack = Stack(n, layers)
-        found = stack.reflection(cosines, b), stack.transmission(cosines, b)
-        exact = [mp.mpf(float(x)) for x in (film, wavenumber, coat, absorbance, n)]
+        found = [one_by_one(law(stack, cosines, b)) for law in (reflect, transmit)]
+        exact = exactly(np.array(case, dtype))
         for i, zenith in enumerate(zeniths):
             square = twin.sine(zenith) ** 2
             depth = exact[3] / mp.sqrt(1 - square / exact[2] ** 2)
@@ -342,13 +311,8 @@ def test_layers(dtype: type) -> None:
             ]
             sizes = max(fields) ** 2, max(truth[1].s, truth[1].p)
             for power, true, size in zip(found, truth, sizes, strict=True):
-                assert power.mean.dtype == dtype
-                difference = power.contrast * power.sin_squared
-                straight = power.mean + difference, power.mean - difference, power.cross
-                bounds = BOUND[dtype] * size, BOUND[dtype] * size, 1e-3
-                for value, one, bound in zip(straight, true, bounds, strict=True):
-                    gap = abs(mp.mpf(float(value[i])) - one)
-                    assert gap <= bound, f"{case}, {zenith} degrees: {float(gap):.1e}"
+                allowed = [size, size, 1e-3 / BOUND[dtype]]
+                assert_accurate(power[:, i], true, dtype, [(case, zenith)] * 3, size=allowed)
 
 
 @PRECISIONS
@@ -371,8 +335,7 @@ def test_scene_in_polarized_light(dtype: type) -> None:
                 "light_degree": dtype(degree),
                 "light_angle": dtype(angle),
             }
-            found = np.asarray(scene.stokes(parameters, geometry))[:, 0]
-            assert found.dtype == dtype
+            found = stokes_of(scene, parameters, geometry)[:, 0]
             share, turn = mp.mpf(float(dtype(degree))), 2.0 * angle
             for i, (view, light, azimuth) in enumerate(directions):
                 b = twin.facet(view, light, azimuth).sin_squared
@@ -380,7 +343,7 @@ def test_scene_in_polarized_light(dtype: type) -> None:
                     s, p = twin.boundary(b, mp.mpf(1), [], mp.mpf(1.5)).reflected
                     powers = twin.Powers(abs(s) ** 2, abs(p) ** 2, mp.re(s * mp.conj(p)))
                 else:
-                    n, thickness, m, absorbance = (mp.mpf(float(dtype(x))) for x in (*film, *coat))
+                    n, thickness, m, absorbance = exactly(np.array([*film, *coat], dtype))
                     wavenumber = 2 * mp.pi * thickness / mp.mpf(WAVELENGTH)
                     powers, _ = twin.coated(b, [(n, wavenumber)], m, absorbance, mp.mpf(1.5))
                 truth = twin.mirrored(
@@ -390,9 +353,8 @@ def test_scene_in_polarized_light(dtype: type) -> None:
                     share * twin.cosine(turn),
                     share * twin.sine(turn),
                 )
-                size = (powers.s + powers.p) / 2
-                for value, true in zip(found[i], truth, strict=True):
-                    assert abs(mp.mpf(float(value)) - true) <= BOUND[dtype] * size, names[i]
+                size = np.full(3, (powers.s + powers.p) / 2)
+                assert_accurate(found[i], truth, dtype, [names[i]] * 3, size=size)
 
 
 @PRECISIONS
@@ -436,53 +398,42 @@ def test_density_of_grooves(distribution: Beckmann | GGX, dtype: type) -> None:
 
 @PRECISIONS
 def test_shadowing(dtype: type) -> None:
-    shares = np.array([1e-6, 1e-3, 0.3, 1.0 - 1e-6, 1.0], dtype)
-    view, light = (grid.ravel() for grid in np.meshgrid(shares, shares))
-    pairs = [(mp.mpf(float(v)), mp.mpf(float(l_))) for v, l_ in zip(view, light, strict=True)]
-    names = [f"{v}, {l_}" for v, l_ in zip(view, light, strict=True)]
+    shares = [1e-6, 1e-3, 0.3, 1.0 - 1e-6, 1.0]
+    view, light = grid(dtype, shares, shares)
+    v, l_ = exactly(view), exactly(light)
     for rule, truth in (
-        (SeparableShadowing(), [v * l_ for v, l_ in pairs]),
-        (HeightCorrelatedShadowing(), [1 / (1 / v + 1 / l_ - 1) for v, l_ in pairs]),
-        (NoShadowing(), [mp.mpf(1)] * len(pairs)),
+        (SeparableShadowing(), v * l_),
+        (HeightCorrelatedShadowing(), 1 / (1 / v + 1 / l_ - 1)),
+        (NoShadowing(), v / v),
     ):
-        assert_accurate(rule.both(view, light), truth, dtype, names)
+        assert_accurate(rule.both(view, light), truth, dtype, view, light)
 
 
 @PRECISIONS
 def test_dispersion(dtype: type) -> None:
     colors = np.array([300.0, 450.0, 587.5618, 700.0, 2000.0], dtype)
     precision = {"any parameter": jnp.zeros((), dtype)}
-    names = [f"{color} nm" for color in colors]
-    squares = [(mp.mpf(float(color)) / 1000) ** 2 for color in colors]
-    a, b, c = (mp.mpf(float(dtype(x))) for x in (1.45, 0.005, 1e-4))
-    for law, last in ((Cauchy(1.45, 0.005, 1e-4), c), (Cauchy(1.45, 0.005), 0)):
-        truth = [a + b / square + last / square**2 for square in squares]
-        assert_accurate(law.index(precision, colors), truth, dtype, names)
+    square = (exactly(colors) / 1000) ** 2
+    a, b, c = exactly(np.array([1.45, 0.005, 1e-4], dtype))
     glass = Sellmeier((1.03961212, 0.231792344), (0.00600069867, 0.0200179144))
-    strengths, resonances = (
-        [mp.mpf(float(dtype(x))) for x in values] for values in (glass.strengths, glass.resonances)
-    )
-    truth = [
-        mp.sqrt(
-            1 + sum(s * square / (square - r) for s, r in zip(strengths, resonances, strict=True))
-        )
-        for square in squares
-    ]
-    assert_accurate(glass.index(precision, colors), truth, dtype, names)
+    pairs = exactly(np.array([glass.strengths, glass.resonances], dtype)).T
+    for law, truth in (
+        (Cauchy(1.45, 0.005, 1e-4), a + b / square + c / square**2),
+        (Cauchy(1.45, 0.005), a + b / square),
+        (glass, digitwise(mp.sqrt)(1 + sum(s * square / (square - r) for s, r in pairs))),
+    ):
+        assert_accurate(law.index(precision, colors), truth, dtype, colors)
 
 
 @PRECISIONS
 def test_overlap_of_the_beam(dtype: type) -> None:
     """Where the footprint fills the sample and far beyond; view and overlap up to 89.99 degrees."""
-    zeniths = np.array([0.0, 45.0, 79.9, 80.0, 80.1, 88.0, 89.99], dtype)
-    view, fills = (grid.ravel()[:, None] for grid in np.meshgrid(zeniths, zeniths[1:]))
-    geometry = Geometry(view, *(np.zeros_like(view) for _ in range(3)))
-    light = Light(*(jnp.ones_like(view) for _ in range(3)))
-    found = BeamOverlap().record({"beam_overlap_zenith": fills}, geometry, light)
+    zeniths = [0.0, 45.0, 79.9, 80.0, 80.1, 88.0, 89.99]
+    view, fills = grid(dtype, zeniths, zeniths[1:])
+    geometry = Geometry(view[:, None], *np.zeros((3, view.size, 1), dtype))
+    light = Light(*jnp.ones((3, view.size, 1), dtype))
+    found = BeamOverlap().record({"beam_overlap_zenith": fills[:, None]}, geometry, light)
     np.testing.assert_array_equal(found[1:], light[1:])
-    truth = [
-        (1 + (twin.cosine(f) / twin.cosine(v)) ** 8) ** (-mp.mpf(1) / 8)
-        for v, f in zip(view.ravel(), fills.ravel(), strict=True)
-    ]
-    names = [f"{v}, fills at {f}" for v, f in zip(view.ravel(), fills.ravel(), strict=True)]
-    assert_accurate(found.intensity, truth, dtype, names)
+    ratio = digitwise(twin.cosine)(fills) / digitwise(twin.cosine)(view)
+    truth = (1 + ratio**8) ** (-mp.mpf(1) / 8)
+    assert_accurate(found.intensity, truth, dtype, view, fills)

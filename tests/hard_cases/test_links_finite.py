@@ -7,11 +7,11 @@ prediction and the noise parameters are finite, in both precisions.
 
 import itertools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import each
+from digits import assert_finite, value_gradient_hessian
 from synthetic_observations import make_observations
 
 from polar_bayes.observation.links import (
@@ -63,25 +63,13 @@ LINKS = {
 }
 
 
-# One of each class in double precision, and the Beta link in single precision, by default.
+FIRST = [(name, np.float64) for name in ("Beta, steep", "Stokes, stated", "intensity")]
+FIRST += [("Beta, steep", np.float32)]  # one of each class in double precision, one in single
 RUNS = [(name, dtype) for name in LINKS for dtype in (np.float64, np.float32)]
-FIRST = [(name, np.float64) for name in ("Beta, steep", "Stokes, stated", "intensity")] + [
-    ("Beta, steep", np.float32)
-]
 
 
-@each(("name", "dtype"), FIRST)
+@each(("name", "dtype"), sorted(RUNS, key=lambda run: run not in FIRST), quick=len(FIRST))
 def test_density_gradient_and_hessian_of_a_link_are_finite(name, dtype):
-    check_finite(name, dtype)
-
-
-@pytest.mark.thorough
-@each(("name", "dtype"), [run for run in RUNS if run not in FIRST])
-def test_density_gradient_and_hessian_of_other_schedules_are_finite(name, dtype):
-    check_finite(name, dtype)
-
-
-def check_finite(name, dtype):
     variable, link, predictions, readings, levels = LINKS[name]
     stopped = (False, True) if variable == "intensity" else (False,)
     # A sensor reports nothing below zero, and stops at full scale at the latest.
@@ -105,19 +93,8 @@ def check_finite(name, dtype):
         distribution = link.distribution(variable, prediction, data, noise)
         return distribution.log_prob(link.reading(reading[None]))[0]
 
-    def derivatives(inputs, fixed):
-        # A Hessian times a vector without zeros hides nothing: one entry spoils its row.
-        tangent = jnp.asarray([0.7, -1.3, 0.9][: inputs.size], dtype)
-        (value, gradient), (_, hessian) = jax.jvp(
-            jax.value_and_grad(lambda x: density(x, fixed)), (inputs,), (tangent,)
-        )
-        return value, gradient, hessian
-
-    found = jax.jit(jax.vmap(derivatives))(rows[:, 4:], rows[:, :4])
-    for what, result in zip(("density", "gradient", "Hessian"), found, strict=True):
-        assert result.dtype == dtype
-        wrong = ~np.isfinite(np.asarray(result)).reshape(len(rows), -1).all(axis=1)
-        assert not wrong.any(), f"{what} of {name} is not finite at {rows[wrong][:5]}"
+    found = value_gradient_hessian(density, rows[:, 4:], rows[:, :4])
+    assert_finite(found, rows, dtype)
 
 
 def test_the_concentrations_of_these_cases_span_the_range_of_the_specification():

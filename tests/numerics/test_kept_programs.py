@@ -87,9 +87,7 @@ def kept_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
     jax.config.update("jax_compilation_cache_dir", before)
 
 
-def test_a_program_that_another_version_left_in_the_cache_of_jax_is_kept(
-    tmp_path: Path, kept_here: None
-) -> None:
+def test_a_program_that_another_version_left_in_the_cache_of_jax_is_kept(tmp_path, kept_here):
     """Whether its key comes with its function or later, as of a compiled model."""
 
     def shifted(x: jax.Array) -> jax.Array:

@@ -28,14 +28,9 @@ def make_capture(*leading, wavelength=False, level=None, **replaced):
         "intensity_error": random.uniform(0.5, 1.0, shape),
         **replaced,
     }
-    angles = {
-        "view_zenith": ZENITHS,
-        "view_azimuth": np.full(4, 120.0),
-        "light_zenith": np.full(4, 45.0),
-        "light_azimuth": np.full(4, 10.0),
-    }
+    angles = zip(ANGLES, np.broadcast_arrays(ZENITHS, 120.0, 45.0, 10.0), strict=True)
     capture = xr.Dataset(
-        {name: ("view", angle) for name, angle in angles.items()}
+        {name: ("view", angle) for name, angle in angles}
         | {name: (dims, value) for name, value in variables.items() if value is not None}
     )
     if wavelength:
@@ -56,8 +51,7 @@ def test_axes_are_leading_then_wavelength_then_view(leading, wavelength):
     for name in ("dop", "q", "u"):
         np.testing.assert_array_equal(data.readings[name], capture[name].transpose(*order))
     np.testing.assert_array_equal(data.errors["q"], capture["q_error"].transpose(*order))
-    for array in (data.brightness, data.valid, data.saturated):
-        assert array.shape == data.shape
+    assert data.brightness.shape == data.valid.shape == data.saturated.shape == data.shape
     for direction in jax.tree.leaves(data.geometry):
         assert np.broadcast_shapes(direction.shape, data.shape) == data.shape
     if wavelength:
@@ -128,22 +122,36 @@ def test_views_beyond_the_limit_are_set_aside_and_the_limit_itself_stays():
 INTENSITY = np.array([8.0, 10.0, 20.0, 40.0])
 
 
-def test_without_a_level_the_largest_reading_is_the_unit_of_readings_and_errors():
-    data = observe(make_capture(intensity=INTENSITY, intensity_error=np.full(4, 2.0)))
-    np.testing.assert_array_equal(data.errors["intensity"], np.full(4, 0.05))
-    np.testing.assert_array_equal(data.readings["intensity"], INTENSITY / 40.0)
-    np.testing.assert_array_equal(data.brightness, INTENSITY / 40.0)
-    assert float(data.intensity_unit) == 40.0
-    assert float(data.full_scale) == np.inf
-    assert not np.any(data.saturated)
+UNITS = {  # what is recorded; brightness, unit, full scale and views at which the sensor stopped
+    "without a level the largest reading": ({}, INTENSITY / 40.0, 40.0, np.inf, False),
+    "a stated level": ({"level": 80.0}, INTENSITY / 80.0, 80.0, 1.0, False),
+    "a masked spike dims no other view": (
+        {"intensity": [8.0, 10.0, 1e6, 40.0], "valid": [True, True, False, True]},
+        [0.2, 0.25, 0.5, 1.0], 40.0, np.inf, False,
+    ),
+    "without light": ({"intensity": np.zeros(4), "intensity_error": None}, 0.0, 1.0, np.inf, False),
+    "unknown light": ({"intensity": None, "intensity_error": None}, 1.0, 1.0, np.inf, False),
+    # Brighter than the level is no brighter for the noise; the reading itself stays. A reading at
+    # the level has stopped whether flagged or not.
+    "stopped": (
+        {"level": 20.0, "saturated": [True, False, False, False]},
+        [0.4, 0.5, 1.0, 1.0], 20.0, 1.0, [True, False, True, True],
+    ),
+}  # fmt: skip
 
 
-def test_a_stated_level_is_the_unit_and_the_full_scale():
-    data = observe(make_capture(intensity=INTENSITY, level=80.0))
-    np.testing.assert_array_equal(data.readings["intensity"], INTENSITY / 80.0)
-    np.testing.assert_array_equal(data.brightness, INTENSITY / 80.0)
-    assert float(data.intensity_unit) == 80.0
-    assert float(data.full_scale) == 1.0
+@each(("given", "brightness", "unit", "full_scale", "stopped"), UNITS.values(), ids=UNITS)
+def test_the_unit_of_readings_and_errors(given, brightness, unit, full_scale, stopped):
+    capture = make_capture(**{"intensity": INTENSITY} | given)
+    data = observe(capture)
+    np.testing.assert_array_equal(data.brightness, np.broadcast_to(brightness, 4))
+    np.testing.assert_array_equal(data.saturated, np.broadcast_to(stopped, 4))
+    assert (float(data.intensity_unit), float(data.full_scale)) == (unit, full_scale)
+    seen = np.asarray(data.valid)
+    for arrays, name in ((data.readings, "intensity"), (data.errors, "intensity_error")):
+        if name in capture:
+            expected = capture[name].to_numpy()[seen] / unit
+            np.testing.assert_array_equal(arrays["intensity"][seen], expected)
 
 
 @pytest.mark.thorough
@@ -161,30 +169,6 @@ def test_the_largest_reading_is_that_of_all_wavelengths_and_materials():
     data = observe(capture)
     assert float(data.intensity_unit) == float(capture["intensity"].max())
     assert float(np.max(data.brightness)) == 1.0
-
-
-def test_a_masked_spike_dims_no_other_view():
-    spiked = np.array([8.0, 10.0, 1e6, 40.0])
-    data = observe(make_capture(intensity=spiked, valid=[True, True, False, True]))
-    np.testing.assert_array_equal(data.brightness, [0.2, 0.25, 0.5, 1.0])
-
-
-@pytest.mark.thorough
-@each(("intensity", "brightness"), [(np.zeros(4), 0.0), (None, 1.0)], ids=["dark", "unknown"])
-def test_without_light_views_are_dark_and_without_intensity_bright(intensity, brightness):
-    data = observe(make_capture(intensity=intensity, intensity_error=None))
-    np.testing.assert_array_equal(data.brightness, np.full(4, brightness))
-    assert float(data.intensity_unit) == 1.0
-    assert float(data.full_scale) == np.inf
-
-
-def test_a_reading_at_the_stated_level_has_stopped_whether_flagged_or_not():
-    flagged = np.array([True, False, False, False])
-    data = observe(make_capture(intensity=INTENSITY, level=20.0, saturated=flagged))
-    np.testing.assert_array_equal(data.saturated, [True, False, True, True])
-    # Brighter than the level is no brighter for the noise; the reading itself stays.
-    np.testing.assert_array_equal(data.brightness, [0.4, 0.5, 1.0, 1.0])
-    np.testing.assert_array_equal(data.readings["intensity"], INTENSITY / 20.0)
 
 
 # --- trust in the normal --------------------------------------------------------------------------

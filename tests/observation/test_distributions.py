@@ -9,6 +9,7 @@ import numpy as np
 import numpyro
 import pytest
 from cases import each
+from digits import assert_accurate, assert_finite, exactly, value_gradient_hessian
 from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer.util import log_density
@@ -21,19 +22,14 @@ from polar_bayes.observation.distributions import (
     log_survival,
 )
 
-BOUND = {np.float64: 1e-10, np.float32: 1e-4}
 PRECISIONS = each("dtype", [np.float64, np.float32])
+
+pytestmark = pytest.mark.usefixtures("fifty_digits")
 
 MEANS = (1e-6, 1e-4, 0.1, 0.5, 0.9, 1 - 1e-4)
 CONCENTRATIONS = (1e-3, 1.0, 5.0, 300.0, 1e5, 1e8)
 MARGINS = (1e-6, 1e-4, 1e-3, 1 - 1e-3, 1 - 1e-4, 1 - 1e-6)
 DEGREES_OF_FREEDOM = (3.0, 5.0, 7.0)
-
-
-@pytest.fixture(autouse=True)
-def fifty_digits():
-    with mp.workdps(50):
-        yield
 
 
 def beta_cases(dtype):
@@ -69,38 +65,27 @@ def sensor_log_density(row, degrees_of_freedom):
     ).log_prob(reading)
 
 
-def exactly(row):
-    return [mp.mpf(float(value)) for value in row]
-
-
-def assert_accurate(values, truth, rows, dtype):
-    """Relative to max(1, |truth|). The twin reads the inputs as the precision holds them.
-
-    So the rounding of the inputs, which a concentration of 1e8 would blow up, is on both sides,
-    and the bound holds at every case: no case needs slack for the conditioning of its inputs.
-    """
-    assert values.dtype == dtype
-    gaps = [abs(mp.mpf(float(v)) - t) / max(1, abs(t)) for v, t in zip(values, truth, strict=True)]
-    worst = max(range(len(gaps)), key=gaps.__getitem__)
-    assert gaps[worst] <= BOUND[dtype], f"{float(gaps[worst]):.1e} at {rows[worst]}"
+def assert_within(values, truth, rows, dtype):
+    """Relative to max(1, |truth|), at every case: none needs slack for rounded inputs."""
+    assert_accurate(values, truth, dtype, rows, floor=1.0)
 
 
 @PRECISIONS
 def test_the_beta_log_density_agrees_with_fifty_digits(dtype):
     rows = beta_cases(dtype)
     truth = []
-    for mean, concentration, x in map(exactly, rows):
+    for mean, concentration, x in exactly(rows):
         a, b = mean * concentration, (1 - mean) * concentration
         constant = mp.loggamma(a) + mp.loggamma(b) - mp.loggamma(concentration)
         truth.append((a - 1) * mp.log(x) + (b - 1) * mp.log(1 - x) - constant)
-    assert_accurate(np.asarray(jax.jit(jax.vmap(beta_log_density))(rows)), truth, rows, dtype)
+    assert_within(jax.jit(jax.vmap(beta_log_density))(rows), truth, rows, dtype)
 
 
 @PRECISIONS
 def test_the_beta_gradient_agrees_with_fifty_digits(dtype):
     rows = beta_cases(dtype)
     by_mean, by_concentration = [], []  # a reading is data: nothing follows its gradient
-    for mean, concentration, x in map(exactly, rows):
+    for mean, concentration, x in exactly(rows):
         a, b = mean * concentration, (1 - mean) * concentration
         first, second = mp.log(x) - mp.psi(0, a), mp.log(1 - x) - mp.psi(0, b)
         by_mean.append(concentration * (first - second))
@@ -108,7 +93,7 @@ def test_the_beta_gradient_agrees_with_fifty_digits(dtype):
         by_concentration.append(mean * first + (1 - mean) * second + total)
     gradient = np.asarray(jax.jit(jax.vmap(jax.grad(beta_log_density)))(rows))
     for column, truth in enumerate((by_mean, by_concentration)):
-        assert_accurate(gradient[:, column], truth, rows, dtype)
+        assert_within(gradient[:, column], truth, rows, dtype)
 
 
 @PRECISIONS
@@ -117,7 +102,7 @@ def test_the_sensor_log_density_agrees_with_fifty_digits(degrees_of_freedom, dty
     rows = sensor_cases(dtype)
     nu = mp.mpf(degrees_of_freedom)
     truth = []
-    for location, scale, reading, saturated in map(exactly, rows):
+    for location, scale, reading, saturated in exactly(rows):
         distance = (reading - location) / scale
         constant = mp.log(mp.beta(nu / 2, mp.mpf(1) / 2)) + mp.log(nu) / 2 + mp.log(scale)
         inside = -(nu + 1) / 2 * mp.log1p(distance**2 / nu) - constant
@@ -126,7 +111,7 @@ def test_the_sensor_log_density_agrees_with_fifty_digits(degrees_of_freedom, dty
         else:
             truth.append(inside if reading > 0 else mp.log(upper_tail(-distance, nu)))
     values = jax.jit(jax.vmap(lambda row: sensor_log_density(row, degrees_of_freedom)))(rows)
-    assert_accurate(np.asarray(values), truth, rows, dtype)
+    assert_within(values, truth, rows, dtype)
 
 
 def upper_tail(distance, nu):
@@ -142,9 +127,9 @@ def test_the_log_survival_agrees_with_fifty_digits(degrees_of_freedom, dtype):
     steps = np.array([0.0, 1e-12, 1e-4, 0.1, 0.5, 1.0, 2.0, 5.0, 100.0, 1e4, 1e8])
     distances = np.concatenate([-steps, steps]).astype(dtype)
     nu = mp.mpf(degrees_of_freedom)
-    truth = [mp.log(upper_tail(mp.mpf(float(distance)), nu)) for distance in distances]
+    truth = [mp.log(upper_tail(distance, nu)) for distance in exactly(distances)]
     values = jax.jit(lambda distance: log_survival(distance, degrees_of_freedom))(distances)
-    assert_accurate(np.asarray(values), truth, distances, dtype)
+    assert_within(values, truth, distances, dtype)
 
 
 @pytest.mark.thorough
@@ -153,31 +138,10 @@ def test_the_slope_of_the_log_survival_is_minus_the_hazard(dtype):
     distances = np.array([-50.0, -1.0, -1e-9, 0.0, 1e-9, 1.0, 50.0, 1e8], dtype)
     slopes = jax.jit(jax.vmap(jax.grad(lambda distance: log_survival(distance, 5.0))))(distances)
     truth = []
-    for (distance,) in map(exactly, distances[:, None]):
+    for distance in exactly(distances):
         density = (1 + distance**2 / 5) ** -3 / (mp.sqrt(5) * mp.beta(mp.mpf(5) / 2, 0.5))
         truth.append(-density / upper_tail(distance, mp.mpf(5)))
-    assert_accurate(np.asarray(slopes), truth, distances, dtype)
-
-
-def value_gradient_hessian(function, rows):
-    """Return value, gradient and Hessian times a vector without zeros, row by row.
-
-    One entry that is not finite spoils its row, and the product compiles in half the time.
-    """
-    tangent = jnp.asarray([0.7, -1.3, 0.9, 1.1][: rows.shape[1]], rows.dtype)
-
-    def derivatives(row):
-        (value, gradient), (_, hessian) = jax.jvp(jax.value_and_grad(function), (row,), (tangent,))
-        return value, gradient, hessian
-
-    return jax.jit(jax.vmap(derivatives))(rows)
-
-
-def assert_finite(results, rows, dtype):
-    for what, result in zip(("value", "gradient", "Hessian"), results, strict=True):
-        assert result.dtype == dtype
-        wrong = ~np.isfinite(np.asarray(result)).reshape(len(rows), -1).all(axis=1)
-        assert not wrong.any(), f"{what} is not finite at {rows[wrong][:5]}"
+    assert_within(slopes, truth, distances, dtype)
 
 
 @pytest.mark.thorough

@@ -1,14 +1,13 @@
 """Coats and films as a user writes them: against tables, and as parts of a scene."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import each
+from optics import directions, incidence, one_by_one, read, stokes_of
 from scipy.integrate import quad
 
-from polar_bayes.errors import SceneError
 from polar_bayes.physics.coat import AbstractCoat, BackFace, ClearCoat, CoatStack, ThinFilm
-from polar_bayes.physics.geometry import Geometry, cos_degrees, sin_degrees
 from polar_bayes.physics.illumination import PointSource
 from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import Scene
@@ -17,63 +16,53 @@ from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.subsurface import Lambertian
 from polar_bayes.physics.surface import InternalReflection, SmoothSurface
 
-stokes_of = jax.jit(Scene.stokes, static_argnums=0)
-
-VIEWS = Geometry.from_degrees(
-    view_zenith=[0.0, 20.0, 45.0, 60.0, 85.0],
-    view_azimuth=[180.0, 180.0, 170.0, 60.0, 180.0],
-    light_zenith=[0.0, 30.0, 45.0, 60.0, 85.0],
-    light_azimuth=0.0,
+VIEWS = directions(
+    [0.0, 20.0, 45.0, 60.0, 85.0],
+    [180.0, 180.0, 170.0, 60.0, 180.0],
+    [0.0, 30.0, 45.0, 60.0, 85.0],
     wavelength=550.0,
 )
-MATERIAL = {
-    "roughness": 0.2,
-    "refractive_index": 1.6,
-    "coat_refractive_index": 1.45,
-    "coat_absorbance": 0.3,
-    "film_refractive_index": 1.38,
-    "film_thickness": 230.0,
-    "subsurface_fraction": 0.4,
-}
+MATERIAL = {"refractive_index": 1.6, "subsurface_fraction": 1.0}
 
 
-def reflected(coat: AbstractCoat, zenith: np.ndarray, body: np.ndarray, parameters: dict, **color):
+def reflected(coat: AbstractCoat, zenith: np.ndarray, body: np.ndarray, wavelength=None, **values):
     """s and p of one facet."""
-    wavelength = color.get("wavelength")
+    parameters = {name: jnp.asarray(value) for name, value in values.items()}
     stack = Stack(jnp.asarray(body), coat.layers(parameters, wavelength))
-    b = sin_degrees(zenith) ** 2
-    power = stack.reflection(cos_degrees(zenith), b)
-    return power.mean + power.contrast * b, power.mean - power.contrast * b
+    return one_by_one(stack.reflection(*incidence(zenith)))[:2]
 
 
-def test_a_thick_coat_agrees_with_the_table(thick_coats: np.ndarray) -> None:
+def test_a_thick_coat_agrees_with_the_table() -> None:
     """The closed form to the table's ten digits; the transfer-matrix code without absorption.
 
     With absorption that code's index is complex, so that its boundaries reflect up to 4.7e-7 more.
     """
-    coat, body, absorbance, zenith, s_code, p_code, s_closed, p_closed, dolp = thick_coats.T
-    parameters = {
-        "coat_refractive_index": jnp.asarray(coat),
-        "coat_absorbance": jnp.asarray(absorbance),
-    }
-    s, p = reflected(ClearCoat(), zenith, body, parameters)
-    np.testing.assert_allclose(s, s_closed, atol=6e-11)
-    np.testing.assert_allclose(p, p_closed, atol=6e-11)
+    coat, body, absorbance, zenith, *codes, s_closed, p_closed, dolp = read(
+        "coat_incoherent_inc_tmm.csv"
+    )
+    s, p = found = reflected(
+        ClearCoat(), zenith, body, coat_refractive_index=coat, coat_absorbance=absorbance
+    )
+    np.testing.assert_allclose(found, [s_closed, p_closed], atol=6e-11)
     clear = absorbance == 0.0
     assert 0 < clear.sum() < clear.size
-    for found, code in ((s, s_code), (p, p_code)):
-        np.testing.assert_allclose(found[clear], code[clear], atol=1e-9)
-        np.testing.assert_allclose(found[~clear], code[~clear], atol=5e-7)
+    np.testing.assert_allclose(found[:, clear], np.array(codes)[:, clear], atol=1e-9)
+    np.testing.assert_allclose(found[:, ~clear], np.array(codes)[:, ~clear], atol=5e-7)
     np.testing.assert_allclose(((s - p) / (s + p))[clear], dolp[clear], atol=1e-9)
 
 
-def test_a_film_agrees_with_the_table(thin_films: np.ndarray) -> None:
-    n, body, thickness, wavelength, zenith, s_code, p_code, s_airy, p_airy, dolp = thin_films.T
-    parameters = {"film_refractive_index": jnp.asarray(n), "film_thickness": jnp.asarray(thickness)}
-    s, p = reflected(ThinFilm(), zenith, body, parameters, wavelength=jnp.asarray(wavelength))
-    for found, code, airy in ((s, s_code, s_airy), (p, p_code, p_airy)):
-        np.testing.assert_allclose(found, code, atol=1e-9)
-        np.testing.assert_allclose(found, airy, atol=1e-9)
+def test_a_film_agrees_with_the_table() -> None:
+    n, body, thickness, wavelength, zenith, *tables, dolp = read("thinfilm_coherent_tmm.csv")
+    s, p = found = reflected(
+        ThinFilm(),
+        zenith,
+        body,
+        jnp.asarray(wavelength),
+        film_refractive_index=n,
+        film_thickness=thickness,
+    )
+    for table in (tables[:2], tables[2:]):  # the code, and Airy's form
+        np.testing.assert_allclose(found, table, atol=1e-9)
     np.testing.assert_allclose((s - p) / (s + p), dolp, atol=2e-9)
 
 
@@ -84,13 +73,9 @@ def test_a_body_under_a_coat_of_its_own_index() -> None:
     Fi_tau is the integral over the cosine inside of what the air boundary returns, twice filtered.
     """
     n, tau, albedo = 1.6, 0.3, 0.7
-    scene = Scene(
-        SmoothSurface(),
-        Lambertian(albedo, InternalReflection()),
-        StokesMixing(),
-        coat=ClearCoat(n, tau),
-    )
-    found = stokes_of(scene, {**MATERIAL, "subsurface_fraction": 1.0}, VIEWS)
+    body = Lambertian(albedo, InternalReflection())
+    scene = Scene(SmoothSurface(), body, StokesMixing(), coat=ClearCoat(n, tau))
+    found = stokes_of(scene, MATERIAL, VIEWS)
     critical = np.sqrt(1.0 - 1.0 / n**2)
 
     def mirrored(inner: float) -> float:
@@ -101,16 +86,13 @@ def test_a_body_under_a_coat_of_its_own_index() -> None:
 
     returned = sum(quad(mirrored, *ends)[0] for ends in ((1e-9, critical), (critical, 1.0)))
     bare = Stack(jnp.asarray(n))
-    sines = [sin_degrees(z) ** 2 for z in (VIEWS.light_zenith, VIEWS.view_zenith)]
-    into, out = (
-        bare.transmission(cos_degrees(z), b)
-        for z, b in zip((VIEWS.light_zenith, VIEWS.view_zenith), sines, strict=True)
-    )
-    slant = sum(1.0 / np.sqrt(1.0 - b / n**2) for b in sines)
+    ends = incidence(VIEWS.light_zenith), incidence(VIEWS.view_zenith)
+    into, out = (bare.transmission(*end) for end in ends)
+    slant = sum(1.0 / np.sqrt(1.0 - b / n**2) for _, b in ends)
     bright = albedo / (np.pi * n**2 * (1.0 - albedo * returned)) * np.exp(-tau * slant)
-    bright = bright * cos_degrees(VIEWS.light_zenith) * into.mean
+    bright = bright * ends[0][0] * into.mean
     np.testing.assert_allclose(found[:, 0], bright * out.mean, rtol=1e-6)
-    expected = bright * out.contrast * sines[1]
+    expected = bright * out.contrast * ends[1][1]
     np.testing.assert_allclose(found[:, 1], expected, rtol=1e-6, atol=1e-16)
 
 
@@ -134,16 +116,10 @@ def test_a_clear_coat_has_no_filter_in_the_program() -> None:
 # --- The back of a plate --------------------------------------------------------------------------
 
 DEGREES = np.array([0.0, 20.0, 45.0, 56.3, 75.0, 89.9])
-BESIDE = Geometry.from_degrees(
-    view_zenith=DEGREES,
-    view_azimuth=180.0,
-    light_zenith=DEGREES,
-    light_azimuth=0.0,
-    wavelength=550.0,
-)
+BESIDE = directions(DEGREES, 180.0, DEGREES, 0.0, 550.0)
 
 
-@pytest.mark.parametrize("absorbance", [0.0, 0.4])
+@each("absorbance", [0.0, 0.4])
 def test_a_share_of_the_light_from_the_back_adds_to_that_of_the_front(absorbance: float) -> None:
     """R + share T^2 A^2 R/(1 - A^2 R^2) for s and p, from amplitudes."""
     n, share = 1.515, 0.7
@@ -162,7 +138,7 @@ def test_a_share_of_the_light_from_the_back_adds_to_that_of_the_front(absorbance
         assert np.all(found <= 1.0 + 1e-15)  # nothing is gained, even at grazing
 
 
-@pytest.mark.parametrize("film", [None, ThinFilm(1.38, 100.0)])
+@each("film", [ThinFilm(1.38, 100.0), None], quick=1)
 def test_the_whole_back_is_a_coat_on_air_and_none_of_it_is_a_plate(film: ThinFilm | None) -> None:
     """In polarized light and under a film, too: a coat of the plate's index on a body of 1."""
     beam, n = PointSource(LinearPolarization(0.6, 30.0)), 1.515
@@ -174,21 +150,3 @@ def test_the_whole_back_is_a_coat_on_air_and_none_of_it_is_a_plate(film: ThinFil
         found = stokes_of(scene, {"refractive_index": n, "back_face_share": share}, BESIDE)
         expected = stokes_of(same, {"refractive_index": index}, BESIDE)
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-15)
-
-
-def test_viewer_and_light_may_change_places_at_a_plate_with_its_back() -> None:
-    scene = Scene(SmoothSurface(back=BackFace(0.7)))
-    there = Geometry.from_degrees(
-        view_zenith=[20.0, 70.0], view_azimuth=180.0, light_zenith=[40.0, 65.0], light_azimuth=0.0
-    )
-    values = {"refractive_index": 1.5}
-    found = (
-        stokes_of(scene, values, there)[:, :2],
-        stokes_of(scene, values, there.reversed())[:, :2],
-    )
-    np.testing.assert_allclose(*found, rtol=1e-12, atol=1e-15)
-
-
-def test_a_back_that_is_no_back_face_is_refused() -> None:
-    with pytest.raises(SceneError, match=r"back: 'black' is no such part; give BackFace\(\)"):
-        SmoothSurface(back="black")  # type: ignore[arg-type]

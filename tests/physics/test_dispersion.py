@@ -1,13 +1,12 @@
 """Laws of dispersion: against tabulated glasses, and as one index per wavelength."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import each
+from optics import directions, predict
 
 from polar_bayes.physics.dispersion import AbstractDispersion, Cauchy, Sellmeier
-from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.subsurface import Depolarizer
@@ -17,13 +16,7 @@ from polar_bayes.physics.surface import RoughSurface
 BK7 = Sellmeier((1.03961212, 0.231792344, 1.01046945), (0.00600069867, 0.0200179144, 103.560653))
 SILICA = Sellmeier((0.6961663, 0.4079426, 0.8974794), (0.0684043**2, 0.1162414**2, 9.896161**2))
 COLORS = jnp.array([[450.0], [550.0], [650.0]])
-VIEWS = Geometry.from_degrees(
-    view_zenith=[20.0, 55.0, 80.0],
-    view_azimuth=180.0,
-    light_zenith=50.0,
-    light_azimuth=0.0,
-    wavelength=COLORS,
-)
+VIEWS = directions([20.0, 55.0, 80.0], 180.0, 50.0, wavelength=COLORS)
 MATERIAL = {
     "roughness": 0.2,
     "subsurface_fraction": 0.4,
@@ -34,7 +27,6 @@ MATERIAL = {
     "sellmeier_resonance": 0.011,
 }
 PARTS = (RoughSurface(), Depolarizer(), StokesMixing())
-predict = jax.jit(Scene.predict, static_argnums=0)
 
 
 @each(

@@ -1,5 +1,7 @@
 """Fresnel's laws against a transfer-matrix code, and the laws they obey."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import mpmath as mp
@@ -7,45 +9,31 @@ import numpy as np
 import pytest
 from cases import each
 from hard_cases.multiprecision import hemispherical_reflection
-from hypothesis import strategies as st
+from optics import incidence, read
 
-from polar_bayes.physics.geometry import cos_degrees, sin_degrees
 from polar_bayes.physics.stack import Stack
 
-angle = st.floats(0.0, 89.99)
-index = st.floats(1.0, 3.0)
 
-
-def at(degrees: float | np.ndarray) -> tuple:
-    return cos_degrees(jnp.asarray(degrees)), sin_degrees(jnp.asarray(degrees)) ** 2
-
-
-def reflected(degrees: float | np.ndarray, n: float | np.ndarray) -> tuple:
+def shared(law: Callable, degrees: np.ndarray, n: np.ndarray) -> tuple:
     """Mean of s and p, and half their difference."""
-    power = Stack(jnp.asarray(n)).reflection(*at(degrees))
+    power = law(Stack(jnp.asarray(n)), *incidence(degrees))
     return power.mean, power.contrast * power.sin_squared
 
 
-def transmitted(degrees: float | np.ndarray, n: float | np.ndarray) -> tuple:
-    power = Stack(jnp.asarray(n)).transmission(*at(degrees))
-    return power.mean, power.contrast * power.sin_squared
-
-
-def test_reflection_agrees_with_the_transfer_matrix(fresnel_curves: np.ndarray) -> None:
+def test_reflection_agrees_with_the_transfer_matrix() -> None:
     """The table gives ten digits: 1e-9 of the value is its rounding."""
-    n, theta, s, p, dolp = fresnel_curves.T[:5]
-    mean, difference = reflected(theta, n)
+    n, theta, s, p, dolp = read("fresnel_smooth_curves.csv")[:5]
+    mean, difference = shared(Stack.reflection, theta, n)
     np.testing.assert_allclose(mean + difference, s, rtol=1e-9)
     # p vanishes at Brewster's angle and is a difference there.
     np.testing.assert_allclose(mean - difference, p, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(difference / mean, dolp, rtol=1e-9, atol=1e-12)
 
 
-def test_exit_agrees_with_the_transfer_matrix(fresnel_curves: np.ndarray) -> None:
+def test_exit_agrees_with_the_transfer_matrix() -> None:
     """The table's polarization at exit is a difference of ten-digit numbers near the normal."""
-    n, theta = fresnel_curves.T[:2]
-    s, p, dolp, stable = fresnel_curves.T[6:10]
-    mean, difference = transmitted(theta, n)
+    n, theta, _, _, _, _, s, p, dolp, stable = read("fresnel_smooth_curves.csv")[:10]
+    mean, difference = shared(Stack.transmission, theta, n)
     np.testing.assert_allclose(mean, (s + p) / 2, rtol=1e-9)
     np.testing.assert_allclose(-difference / mean, dolp, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(-difference / mean, stable, rtol=1e-9, atol=1e-15)

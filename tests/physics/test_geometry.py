@@ -7,6 +7,7 @@ import vector_optics as twin
 from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from optics import directions
 
 from polar_bayes.physics.geometry import (
     Geometry,
@@ -27,9 +28,7 @@ def at(view: float, light: float, difference: float, turn: float = 0.0) -> Geome
 
 
 def test_angles_broadcast_to_one_shape_and_one_float() -> None:
-    geometry = Geometry.from_degrees(
-        view_zenith=np.array([10, 20, 30]), view_azimuth=180, light_zenith=[45.0], light_azimuth=0
-    )
+    geometry = directions(np.array([10, 20, 30]), 180, [45.0], 0)
     assert all(angle.shape == (3,) for angle in geometry[:4])
     assert all(angle.dtype == jnp.float64 for angle in geometry[:4])
     assert geometry.wavelength is None
@@ -37,16 +36,12 @@ def test_angles_broadcast_to_one_shape_and_one_float() -> None:
 
 def test_single_precision_stays_single() -> None:
     angle = np.float32([10.0, 20.0])
-    geometry = Geometry.from_degrees(
-        view_zenith=angle, view_azimuth=angle, light_zenith=angle, light_azimuth=angle
-    )
+    geometry = directions(angle, angle, angle, angle)
     assert all(one.dtype == jnp.float32 for one in geometry[:4])
 
 
 def test_on_the_normal_the_frame_comes_from_the_light() -> None:
-    geometry = Geometry.from_degrees(
-        view_zenith=[0.0, 10.0], view_azimuth=77.0, light_zenith=30.0, light_azimuth=20.0
-    )
+    geometry = directions([0.0, 10.0], 77.0, 30.0, 20.0)
     np.testing.assert_array_equal(geometry.view_azimuth, [200.0, 77.0])
 
 
@@ -69,9 +64,7 @@ def test_a_negative_zenith_is_the_other_side(view: float, light: float, differen
 
 @given(view=zenith, light=zenith, turn=azimuth, difference=azimuth)
 @settings(deadline=None, max_examples=60)
-def test_mirror_slopes_agree_with_vectors(
-    view: float, light: float, turn: float, difference: float
-) -> None:
+def test_mirror_slopes_agree_with_vectors(view, light, turn, difference) -> None:
     """Towards the viewer, and across along the viewer's s axis: relative to the facet's tilt."""
     half = twin.ray(view, turn) + twin.ray(light, turn + difference)
     s, second = twin.axes(view, turn)
@@ -89,9 +82,7 @@ def test_mirror_slopes_agree_with_vectors(
 @pytest.mark.thorough
 @given(view=zenith, light=zenith, turn=azimuth, difference=azimuth)
 @settings(deadline=None, max_examples=60)
-def test_turn_between_frames_agrees_with_vectors(
-    view: float, light: float, turn: float, difference: float
-) -> None:
+def test_turn_between_frames_agrees_with_vectors(view, light, turn, difference) -> None:
     """A mirror that treats s and p alike takes light's s axis to where the angle says."""
     ends = (view, turn), (light, turn + difference)
     geometry = at(view, light, difference, turn)
@@ -106,11 +97,11 @@ def test_turn_between_frames_agrees_with_vectors(
 @pytest.mark.thorough
 def test_the_wavelength_travels_with_the_directions() -> None:
     colors = [[450.0], [650.0]]
-    geometry = Geometry.from_degrees(
-        view_zenith=np.float32([10.0, 20.0]),
-        view_azimuth=np.float32(180.0),
-        light_zenith=np.float32(30.0),
-        light_azimuth=np.float32(0.0),
+    geometry = directions(
+        np.float32([10.0, 20.0]),
+        np.float32(180.0),
+        np.float32(30.0),
+        np.float32(0.0),
         wavelength=colors,
     )
     assert geometry.wavelength.shape == (2, 1)
@@ -122,9 +113,7 @@ def test_the_wavelength_travels_with_the_directions() -> None:
 
 
 def test_reversed_is_light_and_viewer_in_each_others_place() -> None:
-    geometry = Geometry.from_degrees(
-        view_zenith=10.0, view_azimuth=20.0, light_zenith=30.0, light_azimuth=40.0
-    )
+    geometry = directions(10.0, 20.0, 30.0, 40.0)
     back = geometry.reversed()
     assert [float(angle[0]) for angle in back[:4]] == [30.0, 40.0, 10.0, 20.0]
     assert back.wavelength is None

@@ -2,27 +2,23 @@
 
 import itertools
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import each
+from digits import assert_finite, grid
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxtyping import Array
+from optics import read
 
 from polar_bayes.physics.geometry import cos_degrees, sin_degrees
-from polar_bayes.physics.half_space import (
-    CLEAREST,
-    Ray,
-    refract,
-    scatter,
-)
+from polar_bayes.physics.half_space import CLEAREST, Ray, refract, scatter
 
-REFERENCE = Path(__file__).parents[1] / "reference"
 BATCH = 512
+MONTE_CARLO = "vmc_coated_turbid.csv"
 
 
 @jax.jit
@@ -96,27 +92,19 @@ def subsets(*columns: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         yield key, np.all(keys == key, axis=1)
 
 
-def read(name: str) -> np.ndarray:
-    return np.loadtxt(REFERENCE / name, delimiter=",", skiprows=1).T
-
-
-@pytest.fixture(scope="module")
-def monte_carlo() -> np.ndarray:
-    return read("vmc_coated_turbid.csv")
-
-
-def loses_light(monte_carlo: np.ndarray) -> np.ndarray:
+def loses_light(table: np.ndarray) -> np.ndarray:
     """Rows of a clear, polarizing body: the table's README says why."""
-    return (monte_carlo[1] == 0.99) & (monte_carlo[2] == 1.0)
+    return (table[1] == 0.99) & (table[2] == 1.0)
 
 
-def test_beams_agree_with_the_monte_carlo(monte_carlo: np.ndarray) -> None:
+def test_beams_agree_with_the_monte_carlo() -> None:
     """Per index, albedo and fraction: q and u within .0025 rms, intensity within .6 %.
 
     The table's standard errors are about as large. Where it loses light, its polarization is met
     within .015 rms, and its intensity is not asked.
     """
-    table = monte_carlo[:, monte_carlo[3] >= 0.0]
+    table = read(MONTE_CARLO)
+    table = table[:, table[3] >= 0.0]
     n, albedo, fraction, light = table[:4]
     error = differences(under_beam(n, albedo, fraction, light, *table[6:8]), table[8:11])
     for key, rows in subsets(n, albedo, fraction, loses_light(table)):
@@ -125,15 +113,17 @@ def test_beams_agree_with_the_monte_carlo(monte_carlo: np.ndarray) -> None:
         assert key[3] or intensity < 0.006, key
 
 
-def test_the_monte_carlo_loses_light_only_where_it_is_excused(monte_carlo: np.ndarray) -> None:
-    table = monte_carlo[:, monte_carlo[3] >= 0.0]
+def test_the_monte_carlo_loses_light_only_where_it_is_excused() -> None:
+    table = read(MONTE_CARLO)
+    table = table[:, table[3] >= 0.0]
     lost = transmittance(table[3], table[0])[0] - table[4] - table[5]
     assert np.all(np.abs(lost[~loses_light(table)]) < 0.004)
     assert np.all(lost[loses_light(table)] > 0.04)
 
 
-def test_a_sky_agrees_with_the_monte_carlo(monte_carlo: np.ndarray) -> None:
-    table = monte_carlo[:, (monte_carlo[3] < 0.0) & ~loses_light(monte_carlo)]
+def test_a_sky_agrees_with_the_monte_carlo() -> None:
+    table = read(MONTE_CARLO)
+    table = table[:, (table[3] < 0.0) & ~loses_light(table)]
     n, albedo, fraction = table[:3]
     error = differences(under_sky(n, albedo, fraction, table[6]) / np.pi, table[8:11])
     for key, rows in subsets(n, albedo, fraction):
@@ -201,14 +191,8 @@ def test_light_is_neither_made_nor_lost() -> None:
 
     Light is returned the more often, the higher the index: so it is absorbed the more.
     """
-    n, fraction, light, absorption = (
-        np.array(column)
-        for column in zip(
-            *itertools.product(
-                [1.0, 1.33, 2.0], [0.0, 0.5, 1.0], [0.0, 50.0, 80.0], [CLEAREST, 0.1, 10.0]
-            ),
-            strict=True,
-        )
+    n, fraction, light, absorption = grid(
+        float, [1.0, 1.33, 2.0], [0.0, 0.5, 1.0], [0.0, 50.0, 80.0], [CLEAREST, 0.1, 10.0]
     )
     (view, ns, fractions, lights, albedos), integral = hemisphere(
         n, fraction, light, 1.0 / (1.0 + absorption)
@@ -238,9 +222,7 @@ materials = st.tuples(st.floats(0.0, 20.0), st.floats(0.0, 1.0))
 
 @given(light=zenith, view=zenith, azimuth=turn, material=materials)
 @settings(deadline=None, max_examples=25)
-def test_viewer_and_light_may_change_places(
-    light: float, view: float, azimuth: float, material: tuple[float, float]
-) -> None:
+def test_viewer_and_light_may_change_places(light, view, azimuth, material) -> None:
     """Helmholtz, for every polarization: the matrix is transposed."""
     there = mueller(light, view, azimuth, *material)
     back = mueller(view, light, -azimuth, *material)
@@ -249,9 +231,7 @@ def test_viewer_and_light_may_change_places(
 
 @given(light=zenith, view=zenith, azimuth=turn, material=materials)
 @settings(deadline=None, max_examples=25)
-def test_the_other_side_of_the_plane_is_a_mirror_image(
-    light: float, view: float, azimuth: float, material: tuple[float, float]
-) -> None:
+def test_the_other_side_of_the_plane_is_a_mirror_image(light, view, azimuth, material) -> None:
     left, right = (mueller(light, view, side * azimuth, *material) for side in (1.0, -1.0))
     sign = np.diag([1.0, 1.0, -1.0])
     np.testing.assert_allclose(left, sign @ right @ sign, rtol=1e-9, atol=1e-11 * left[0, 0])
@@ -259,9 +239,7 @@ def test_the_other_side_of_the_plane_is_a_mirror_image(
 
 @given(light=zenith, view=zenith, azimuth=turn, absorption=st.floats(0.0, 20.0))
 @settings(deadline=None, max_examples=25)
-def test_without_rayleigh_scattering_inner_light_is_unpolarized(
-    light: float, view: float, azimuth: float, absorption: float
-) -> None:
+def test_without_rayleigh_scattering_inner_light_is_unpolarized(light, view, azimuth, absorption):
     found = mueller(light, view, azimuth, absorption, 0.0)
     np.testing.assert_allclose(found[1:], 0.0, atol=1e-15)
     np.testing.assert_array_equal(found[:, 2], 0.0)
@@ -269,9 +247,7 @@ def test_without_rayleigh_scattering_inner_light_is_unpolarized(
 
 @given(light=zenith, view=zenith, azimuth=turn, fraction=st.floats(0.0, 1.0))
 @settings(deadline=None, max_examples=25)
-def test_a_black_body_scatters_once(
-    light: float, view: float, azimuth: float, fraction: float
-) -> None:
+def test_a_black_body_scatters_once(light, view, azimuth, fraction) -> None:
     """Rayleigh's law from vectors: a dipole along the field, seen through two analyzers."""
 
     def frame(ray: Ray, turned: float) -> np.ndarray:
@@ -335,15 +311,9 @@ def test_value_gradient_and_hessian_are_finite(dtype: type) -> None:
     materials = itertools.product(
         (0.0, CLEAREST, 0.3, 1e4), (0.0, 0.5, 1.0), (1.0, 1.0 + 1e-6, 1.01, 1.5, 2.42)
     )
-    inputs = np.array(
-        [
-            (*d, q, u, *m)
-            for m in materials
-            for d in directions
-            for q, u in ((0.0, 0.0), (0.6, 0.8))
-        ],
-        dtype,
-    )
+    polarizations = ((0.0, 0.0), (0.6, 0.8))
+    rows = itertools.product(materials, directions, polarizations)
+    inputs = np.array([(*d, *polarization, *m) for m, d, polarization in rows], dtype)
     generator = np.random.default_rng(3)
     weights = jnp.asarray(generator.normal(size=3), dtype)
     tangent = jnp.asarray(generator.normal(size=inputs.shape[1]), dtype)
@@ -363,9 +333,6 @@ def test_value_gradient_and_hessian_are_finite(dtype: type) -> None:
         return values, slope, curvature
 
     results = jax.jit(jax.vmap(derivatives))(jnp.asarray(inputs))
-    for what, result in zip(("value", "gradient", "Hessian"), results, strict=False):
-        assert result.dtype == dtype
-        broken = np.nonzero(~np.all(np.isfinite(result), axis=1))[0]
-        assert broken.size == 0, f"{what} is not finite at {inputs[broken[:8]]}"
+    assert_finite(results, inputs, dtype)
     intensity, q, u = results[0].T
     assert np.all(np.hypot(q, u) <= intensity * (1.0 + 1e-3))

@@ -2,19 +2,20 @@
 
 import dataclasses
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import each
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from optics import BEAM, GROOVED, between_points, predict, stokes_of
+from optics import at as one_view
+from optics import directions as directions_of
 
-from polar_bayes.physics.coat import AbstractCoat, BackFace, ClearCoat, CoatStack, ThinFilm
+from polar_bayes.physics.coat import BackFace, ClearCoat, CoatStack, ThinFilm
 from polar_bayes.physics.dispersion import Cauchy, Sellmeier
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
-from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
+from polar_bayes.physics.illumination import Disc, UniformSky
 from polar_bayes.physics.instrument import (
     Analyzer,
     AngleZero,
@@ -29,24 +30,31 @@ from polar_bayes.physics.instrument import (
 )
 from polar_bayes.physics.microfacet import (
     GGX,
-    AbstractMicrofacet,
     AnisotropicSlopes,
     Beckmann,
     HeightCorrelatedShadowing,
+    IsotropicSlopes,
     NoShadowing,
     SeparableShadowing,
 )
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
 from polar_bayes.physics.phase_function import HenyeyGreenstein
 from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.second_bounce import TwoBounceSurface
 from polar_bayes.physics.second_passage import TwoFacetPassage
-from polar_bayes.physics.stokes import LinearPolarization
-from polar_bayes.physics.subsurface import Depolarizer, Lambertian, Unpolarized
-from polar_bayes.physics.surface import InternalReflection, RoughSurface, SmoothExit, SmoothSurface
+from polar_bayes.physics.subsurface import Depolarizer, Lambertian, TurbidMedium, Unpolarized
+from polar_bayes.physics.surface import (
+    InternalReflection,
+    RoughPassage,
+    RoughSurface,
+    SmoothExit,
+    SmoothSurface,
+)
 
-BEAM = PointSource(LinearPolarization("light_degree", "light_angle"))
-GROOVED = AnisotropicSlopes("roughness_azimuth")
 FEW = FacetQuadrature(2, 2)
+
+GONIOMETER = (AngleZero(), ChannelGain(), Leakage(), Discrepancy())
+CAMERA = (BeamOverlap(), DolpGain(), DarkLevel(), Saturation(0.2))
 
 # Every part occurs, and every kind of light meets every kind of surface.
 SCENES = {
@@ -55,7 +63,7 @@ SCENES = {
         Lambertian("albedo", InternalReflection()),
         StokesMixing(),
         ClearCoat(),
-        Instrument((AngleZero(), BeamOverlap(), DolpGain(), DarkLevel(), Saturation(0.2))),
+        Instrument((AngleZero(), *CAMERA)),
     ),
     "grooves under a sky, with a film": Scene(
         RoughSurface(GGX(), UniformSky(), FEW, GROOVED, way_out=TwoFacetPassage()),
@@ -68,7 +76,7 @@ SCENES = {
         Unpolarized("albedo"),
         StokesMixing(),
         CoatStack((ThinFilm(), ClearCoat(), ThinFilm("second_index", "second_thickness"))),
-        Instrument((AngleZero(), ChannelGain(), Leakage(), Discrepancy(), Analyzer(30.0))),
+        Instrument((*GONIOMETER, Analyzer(30.0), *CAMERA)),
     ),
     "a disc on a body of its own color": Scene(
         RoughSurface(Beckmann(), Disc(10.0), shadowing=HeightCorrelatedShadowing()),
@@ -88,8 +96,6 @@ SURFACES = {name: Scene(scene.surface, coat=scene.coat) for name, scene in SCENE
 
 every_scene = each("name", sorted(SCENES, key=lambda name: "under a sky" in name), quick=3)
 RUN = settings(deadline=None, max_examples=40, derandomize=True)
-predict = jax.jit(Scene.predict, static_argnums=0)
-stokes_of = jax.jit(Scene.stokes, static_argnums=0)
 
 VALUES = {
     "roughness": st.floats(0.0, 1.0),
@@ -132,10 +138,7 @@ directions = st.tuples(zenith, azimuth, zenith, azimuth)
 
 def at(direction: tuple, turn: float = 0.0) -> Geometry:
     view, va, light, la = direction
-    return Geometry(
-        *(jnp.array([x]) for x in (view, va + turn, light, la + turn)),
-        wavelength=jnp.array([550.0]),
-    )
+    return one_view((view, va + turn), (light, la + turn))
 
 
 # --- light that can be ----------------------------------------------------------------------------
@@ -144,15 +147,18 @@ def at(direction: tuple, turn: float = 0.0) -> Geometry:
 @every_scene
 @given(values=parameters, direction=directions)
 @RUN
-def test_no_light_is_more_than_polarized_or_less_than_dark(
-    name: str, values: dict, direction: tuple
-) -> None:
-    """S0 >= |S|, before the instrument and behind it."""
+def test_no_light_is_more_than_polarized_or_less_than_dark(name, values, direction) -> None:
+    """S0 >= |S|, before the instrument."""
     s0, s1, s2 = np.asarray(stokes_of(SCENES[name], values, at(direction)))[0]
     assert s0 >= 0.0
     assert np.hypot(s1, s2) <= s0 * (1.0 + 1e-11) + 1e-300
-    if SCENES[name].instrument is None:
-        return
+
+
+@each("name", sorted(name for name, scene in SCENES.items() if scene.instrument), quick=1)
+@given(values=parameters, direction=directions)
+@RUN
+def test_no_reading_is_more_than_polarized_or_less_than_dark(name, values, direction) -> None:
+    """Behind an instrument with all its terms, and another."""
     readings = predict(SCENES[name], values, at(direction))
     assert readings["intensity"] >= 0.0
     assert 0.0 <= readings["dop"] <= 1.0 + 1e-9
@@ -189,12 +195,8 @@ def reflected_share(
     up = (view[:, 2] > 1e-9) & (cosine > 0.0)
     view = np.where(up[:, None], view, [0.0, 0.0, 1.0])
     sine = np.hypot(view[:, 0], view[:, 1])
-    geometry = Geometry(
-        jnp.rad2deg(np.arctan2(sine, view[:, 2])),
-        jnp.rad2deg(np.arctan2(view[:, 1], view[:, 0])),
-        jnp.full_like(cosine, light),
-        jnp.zeros_like(cosine),
-    )
+    zenith, turn = np.arctan2(sine, view[:, 2]), np.arctan2(view[:, 1], view[:, 0])
+    geometry = directions_of(np.rad2deg(zenith), np.rad2deg(turn), light)
     brightness = stokes_of(scene, values, geometry)[:, 0]
     solid_angle = 4.0 * cosine * cos_tilt**3 * area
     return float(np.sum(np.where(up, brightness * view[:, 2] * solid_angle, 0.0)) / towards[2])
@@ -220,14 +222,8 @@ def test_a_surface_reflects_no_more_than_it_gets(name: str) -> None:
     for along, across, turn in ((0.05, 0.05, 0.0), (0.4, 0.4, 0.0), (0.5, 0.1, 30.0), (1, 1, 0)):
         for light in (0.0, 60.0, 85.0):
             for degree, angle in ((0.0, 0.0), (1.0, 0.0), (1.0, 90.0)):
-                values = {
-                    "roughness": along,
-                    "roughness_across": across,
-                    "roughness_azimuth": turn,
-                    "refractive_index": 1e3,
-                    "light_degree": degree,
-                    "light_angle": angle,
-                }
+                values = {"roughness": along, "roughness_across": across, "roughness_azimuth": turn}
+                values |= {"light_degree": degree, "light_angle": angle, "refractive_index": 1e3}
                 share = reflected_share(scene, values, light)
                 assert 0.0 < share <= 1.001
                 if light == 0.0 and along == 0.05:
@@ -238,9 +234,7 @@ def test_a_surface_reflects_no_more_than_it_gets(name: str) -> None:
 @each("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
 @each("coat", [None, ClearCoat(1.3, 0.2)], ids=["bare", "coated"])
 @each("light", [0.0, 40.0, 70.0])
-def test_a_nearly_smooth_surface_reflects_what_a_plane_does(
-    distribution: AbstractMicrofacet, coat: AbstractCoat | None, light: float
-) -> None:
+def test_a_nearly_smooth_surface_reflects_what_a_plane_does(distribution, coat, light) -> None:
     """To the square of the roughness; a long tail lets a part in 1,000 go elsewhere."""
     values = {"roughness": 0.003, "roughness_across": 0.003, "refractive_index": 1.5}
     rough = Scene(RoughSurface(distribution), coat=coat)
@@ -264,27 +258,56 @@ def states(scene: Scene, values: dict, direction: tuple) -> np.ndarray:
     return np.stack([none, s - none, diagonal - none], axis=1)
 
 
-@each("name", ["grooves under a polarized beam, lacquered", "nothing hidden, smooth way out"])
+@each("name", [name for name, scene in SCENES.items() if "light_degree" in scene.parameters])
 @given(values=parameters, direction=directions)
 @RUN
 def test_viewer_and_light_may_change_places(name: str, values: dict, direction: tuple) -> None:
-    """Helmholtz, for rough and grooved surfaces under coats, in polarized light."""
+    """Helmholtz, for plates with their backs and grooves under coats, in polarized light."""
     view, va, light, la = direction
     values = values | {"roughness": max(values["roughness"], 0.02)}
     scene = SURFACES[name]
-    forth = states(scene, values, direction) * np.cos(np.deg2rad(view))
-    back = states(scene, values, (light, la, view, va)) * np.cos(np.deg2rad(light))
+    forth, back = states(scene, values, direction), states(scene, values, (light, la, view, va))
+    if isinstance(scene.surface, RoughSurface):  # radiance of an area, over the cosine
+        forth, back = forth * np.cos(np.deg2rad(view)), back * np.cos(np.deg2rad(light))
     np.testing.assert_allclose(back, forth.T, atol=1e-9 * forth[0, 0] + 1e-28)
+
+
+GLOSSY = {"roughness": 0.2, "roughness_across": 0.5, "refractive_index": 1.5}
+STEEP = {"roughness": 0.05, "roughness_across": 0.8, "refractive_index": 1.45}
+STEEP |= {"subsurface_fraction": 1.0, "absorption": 3.0}
+# Grooves polarize what leaves along an axis of their own, and pass more of what agrees.
+GROOVES = RoughSurface(slopes=AnisotropicSlopes(20.0), way_out=RoughPassage())
+BOTH_WAYS = [
+    (Scene(GROOVES, TurbidMedium(1.0), StokesMixing()), STEEP, 1e-12),
+    *(
+        (Scene(TwoBounceSurface(GGX(), shadowing=shadowing, slopes=slopes)), GLOSSY, 1e-9)
+        for shadowing in (HeightCorrelatedShadowing(), SeparableShadowing())
+        for slopes in (AnisotropicSlopes(35.0), IsotropicSlopes())
+    ),
+]
+
+
+@each(("scene", "values", "bound"), BOTH_WAYS, quick=2)
+def test_as_much_light_goes_back_as_came(scene: Scene, values: dict, bound: float) -> None:
+    """Over the cosine of where it goes: at random, in the plane of the mirror side, and grazing."""
+    there = between_points(12, 3)
+    forth, back = (stokes_of(scene, values, each)[:, 0] for each in (there, there.reversed()))
+    cosines = np.cos(np.deg2rad([there.view_zenith, there.light_zenith]))
+    np.testing.assert_allclose(forth * cosines[0], back * cosines[1], rtol=bound)
+
+
+def no_mirror(values: dict) -> dict:
+    """The material with a highlight that is not narrow."""
+    rough = {key: max(values[key], 0.05) for key in ("roughness", "roughness_across")}
+    return values | rough
 
 
 @every_scene
 @given(values=parameters, direction=directions, turn=st.floats(-360.0, 360.0))
 @settings(parent=RUN, max_examples=30)
-def test_turning_sample_viewer_and_light_together_changes_nothing(
-    name: str, values: dict, direction: tuple, turn: float
-) -> None:
+def test_turning_sample_viewer_and_light_together_changes_nothing(name, values, direction, turn):
     """What it leaves of a narrow highlight's brightness is rounding of azimuths, over its width."""
-    values = values | {key: max(values[key], 0.05) for key in ("roughness", "roughness_across")}
+    values = no_mirror(values)
     turned = values | {"roughness_azimuth": values["roughness_azimuth"] + turn}
     here = stokes_of(SCENES[name], values, at(direction))
     there = stokes_of(SCENES[name], turned, at(direction, turn))
@@ -296,7 +319,7 @@ def test_turning_sample_viewer_and_light_together_changes_nothing(
 @settings(parent=RUN, max_examples=30)
 def test_a_mirror_image_has_the_other_sign_of_u(name: str, values: dict, direction: tuple) -> None:
     view, va, light, la = direction
-    values = values | {key: max(values[key], 0.05) for key in ("roughness", "roughness_across")}
+    values = no_mirror(values)
     image = values | {key: -values[key] for key in ("roughness_azimuth", "light_angle")}
     here = np.asarray(stokes_of(SCENES[name], values, at(direction)))
     there = np.asarray(stokes_of(SCENES[name], image, at((view, -va, light, -la))))
@@ -310,19 +333,13 @@ def test_a_mirror_image_has_the_other_sign_of_u(name: str, values: dict, directi
 @pytest.mark.thorough
 @each("distribution", [Beckmann(), GGX()], ids=["Beckmann", "GGX"])
 @each("coat", [None, ThinFilm(1.38, 120.0)], ids=["bare", "filmed"])
-def test_a_smooth_surface_under_a_sky_obeys_fresnel(
-    distribution: AbstractMicrofacet, coat: AbstractCoat | None
-) -> None:
+def test_a_smooth_surface_under_a_sky_obeys_fresnel(distribution, coat) -> None:
     """As roughness goes to zero, grooves or not; the nodes of Beckmann's slopes lack 1.6e-4."""
     scene = Scene(RoughSurface(distribution, UniformSky(), slopes=GROOVED), coat=coat)
-    zeniths = jnp.array([1.0, 30.0, 56.0, 75.0])
-    views = Geometry(zeniths, jnp.zeros(4), zeniths, jnp.full(4, 180.0), jnp.array([550.0]))
-    values = {
-        "roughness": 1e-4,
-        "roughness_across": 1e-5,
-        "roughness_azimuth": 30.0,
-        "refractive_index": 1.5,
-    }
+    zeniths = np.array([1.0, 30.0, 56.0, 75.0])
+    views = directions_of(zeniths, 0.0, zeniths, 180.0, [550.0])
+    values = {"roughness": 1e-4, "roughness_across": 1e-5, "roughness_azimuth": 30.0}
+    values["refractive_index"] = 1.5
     found = stokes_of(scene, values, views)
     mirror = stokes_of(Scene(SmoothSurface(), coat=coat), values, views)
     bound = 2e-5 if isinstance(distribution, GGX) else 2e-4
@@ -336,11 +353,7 @@ def test_a_smooth_surface_under_a_sky_obeys_fresnel(
 def test_a_coat_of_zero_effect_is_no_coat(name: str, values: dict, direction: tuple) -> None:
     """Films of no thickness, coats like air: on grooves under a sky, on a plate, over bodies."""
     scene = dataclasses.replace(SCENES[name], instrument=None, dispersion=None)
-    values = values | {
-        "roughness": max(values["roughness"], 0.05),
-        "roughness_across": max(values["roughness_across"], 0.05),
-        "refractive_index": max(values["refractive_index"], 1.01),
-    }
+    values = no_mirror(values) | {"refractive_index": max(values["refractive_index"], 1.01)}
     bare = stokes_of(dataclasses.replace(scene, coat=None), values, at(direction))
     nothing = CoatStack((ThinFilm("film_refractive_index", 0.0), ClearCoat(1.0, 0.0)))
     found = stokes_of(dataclasses.replace(scene, coat=nothing), values, at(direction))

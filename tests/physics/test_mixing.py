@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from polar_bayes.physics.mixing import DopMixing, StokesMixing
 from polar_bayes.physics.stokes import Light, degree_of_linear_polarization
 
-RULES = each("rule", [DopMixing(), DopMixing(signed=True), StokesMixing()])
 component = st.floats(-0.7, 0.7)
 
 
@@ -36,9 +35,7 @@ def test_the_papers_rule_mixes_degrees(q: float, u: float, body: float, fraction
     fraction=st.floats(0.0, 1.0),
 )
 @settings(deadline=None, max_examples=60)
-def test_stokes_vectors_add(
-    bright: float, q: float, u: float, body: float, fraction: float
-) -> None:
+def test_stokes_vectors_add(bright, q, u, body, fraction) -> None:
     mixture = StokesMixing().mix(jnp.array([fraction]), light(bright, q, u), light(1.0, body))
     total = (1.0 - fraction) * bright + fraction
     np.testing.assert_allclose(mixture.intensity, total, rtol=1e-14)

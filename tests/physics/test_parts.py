@@ -5,12 +5,12 @@ import dataclasses
 import jax.numpy as jnp
 import pytest
 from cases import each
+from optics import BEAM, EVERYTHING, GROOVED, directions
 
 import polar_bayes as pb
 from polar_bayes.physics.coat import ClearCoat, CoatStack, ThinFilm
 from polar_bayes.physics.dispersion import Cauchy, Sellmeier
 from polar_bayes.physics.facets import FacetQuadrature
-from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import Disc, PointSource, SunAndSky, UniformSky
 from polar_bayes.physics.instrument import (
     Analyzer,
@@ -32,7 +32,7 @@ from polar_bayes.physics.microfacet import (
     IsotropicSlopes,
     SeparableShadowing,
 )
-from polar_bayes.physics.mixing import DopMixing, StokesMixing
+from polar_bayes.physics.mixing import DopMixing
 from polar_bayes.physics.phase_function import HenyeyGreenstein
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, SCENES, Scene
 from polar_bayes.physics.second_bounce import TwoBounceSurface
@@ -49,8 +49,6 @@ from polar_bayes.physics.surface import (
 )
 
 PLATE, FILM, LACQUER = SmoothSurface(), ThinFilm(), ClearCoat()
-GROOVED = AnisotropicSlopes("roughness_azimuth")
-BEAM = PointSource(LinearPolarization("light_degree", "light_angle"))
 TERMS = (AngleZero(), DolpGain(), ChannelGain(), Leakage(), DarkLevel(), BeamOverlap())
 TERMS += (Discrepancy(), Analyzer(30.0), Saturation(1.0))
 
@@ -67,14 +65,7 @@ READ = [
         "roughness subsurface_fraction refractive_index normal_tilt_x normal_tilt_y dolp_gain",
     ),
     (
-        Scene(  # the material's in their order, then the light, then the instrument
-            RoughSurface(GGX(), BEAM, slopes=GROOVED, way_out=RoughPassage()),
-            Lambertian("albedo"),
-            StokesMixing(),
-            CoatStack((FILM, LACQUER)),
-            Instrument((AngleZero(), BeamOverlap(), DolpGain())),
-            Cauchy(),
-        ),
+        EVERYTHING,  # the material's in their order, then the light, then the instrument
         "roughness subsurface_fraction roughness_across roughness_azimuth albedo cauchy_a cauchy_b "
         "coat_refractive_index coat_absorbance film_refractive_index film_thickness light_degree "
         "light_angle angle_zero beam_overlap_zenith dolp_gain",
@@ -141,7 +132,7 @@ def test_what_is_simpler_than_a_part(part: object, simpler: tuple) -> None:
     assert part.simpler() == simpler
 
 
-VIEW = Geometry.from_degrees(view_zenith=9.0, view_azimuth=0.0, light_zenith=9.0, light_azimuth=0.0)
+VIEW = directions(9.0, 0.0, 9.0)
 
 
 def lit(**parts: object) -> None:
@@ -172,6 +163,7 @@ REFUSED = [
     (lambda: RoughSurface(shadowing=None), rf"shadowing: None {NO_SUCH} SeparableShadowing\(\), N"),
     (lambda: RoughSurface(way_out="rough"), rf"way_out: 'rough' {NO_SUCH} RoughExit\(\) or Smoot"),
     (lambda: SmoothSurface(UniformSky()), rf"SmoothSurface: beam: UniformSky\(\) {NO_SUCH}"),
+    (lambda: SmoothSurface(back="black"), rf"back: 'black' {NO_SUCH} BackFace\(\)"),
     (lambda: Disc(0.0), "Disc: half_width=.* give degrees from 0.01 to 90"),
     (lambda: Disc(91.0), "Disc: half_width=.* give degrees from 0.01 to 90"),
     (lambda: Disc(float("nan")), "Disc: half_width=.* give degrees from 0.01 to 90"),

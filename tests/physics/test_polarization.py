@@ -8,6 +8,7 @@ import vector_optics as twin
 from cases import each
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from optics import BEAM, at, components, stokes_of
 
 from polar_bayes.physics.coat import ClearCoat, ThinFilm
 from polar_bayes.physics.geometry import Geometry, cos_degrees
@@ -25,24 +26,19 @@ degree = st.floats(0.0, 1.0)
 angle = st.floats(-180.0, 180.0)
 index = st.floats(1.01, 3.0)
 
-BEAM = PointSource(LinearPolarization("degree", "angle"))
 MIRROR = Scene(SmoothSurface(BEAM))
-stokes_of = jax.jit(Scene.stokes, static_argnums=0)
-
-
-def at(view: tuple[float, float], light: tuple[float, float]) -> Geometry:
-    return Geometry(*(jnp.array([x]) for x in (*view, *light)), wavelength=jnp.array([550.0]))
 
 
 def mirrored(
     view: tuple, light: tuple, n: float, degree: float, angle: float, scene: Scene = MIRROR
 ) -> np.ndarray:
-    parameters = {"refractive_index": n, "degree": degree, "angle": angle, "roughness": 0.3}
+    parameters = {
+        "refractive_index": n,
+        "light_degree": degree,
+        "light_angle": angle,
+        "roughness": 0.3,
+    }
     return np.asarray(stokes_of(scene, parameters, at(view, light)))[0]
-
-
-def components(degree: float, angle: float) -> tuple[float, float]:
-    return degree * np.cos(np.deg2rad(2 * angle)), degree * np.sin(np.deg2rad(2 * angle))
 
 
 @given(view=direction, light=direction, n=index, degree=degree, angle=angle)
@@ -52,9 +48,7 @@ def components(degree: float, angle: float) -> tuple[float, float]:
 @example(view=(40.0, 30.0), light=(40.0, 210.0), n=1.5, degree=1.0, angle=20.0)
 @example(view=(0.0, 30.0), light=(60.0, 10.0), n=1.5, degree=1.0, angle=-70.0)
 @example(view=(60.0, 30.0), light=(0.0, 10.0), n=1.5, degree=0.5, angle=100.0)
-def test_a_facet_turns_the_field_as_vectors_do(
-    view: tuple, light: tuple, n: float, degree: float, angle: float
-) -> None:
+def test_a_facet_turns_the_field_as_vectors_do(view, light, n, degree, angle) -> None:
     """Fresnel's amplitudes along explicit axes: all three components, in and out of the plane."""
     powers = twin.bare(n, twin.facet_of(view, light)[0])
     expected = twin.mirrored(powers, view, light, components(degree, angle))
@@ -69,9 +63,7 @@ FILM, COAT = (1.38, 230.0), (1.7, 0.3)
 @pytest.mark.thorough
 @given(view=direction, light=direction, degree=degree, angle=angle)
 @RUN
-def test_a_facet_under_a_film_or_coat_does_so_too(
-    view: tuple, light: tuple, degree: float, angle: float
-) -> None:
+def test_a_facet_under_a_film_or_coat_does_so_too(view, light, degree, angle) -> None:
     b, _ = twin.facet_of(view, light)
     film = twin.powers(twin.films(1.0, ((FILM[0], 2.0 * np.pi * FILM[1] / 550.0),), 1.5, b)[0])
     coat = tuple(twin.bounced((1.0, COAT[0], 1.5), COAT[1:], b, bounces=60)[0])
@@ -84,9 +76,7 @@ def test_a_facet_under_a_film_or_coat_does_so_too(
 
 @given(view=direction, light=direction, n=index, angle=angle)
 @RUN
-def test_degree_0_and_orthogonal_pairs_are_unpolarized_light(
-    view: tuple, light: tuple, n: float, angle: float
-) -> None:
+def test_degree_0_and_orthogonal_pairs_are_unpolarized_light(view, light, n, angle) -> None:
     for surface, beam in (
         (SmoothSurface(), SmoothSurface(BEAM)),
         (RoughSurface(), RoughSurface(illumination=BEAM)),
@@ -100,16 +90,6 @@ def test_degree_0_and_orthogonal_pairs_are_unpolarized_light(
         np.testing.assert_allclose(0.5 * (pair[0] + pair[1]), plain, rtol=1e-12, atol=10 * slack)
 
 
-def mueller(view: tuple, light: tuple, n: float, scene: Scene = MIRROR) -> np.ndarray:
-    """Matrix from light to viewer (3 x 3), from four incident states."""
-    none, s, diagonal, p = (
-        mirrored(view, light, n, *state, scene)
-        for state in ((0.0, 0.0), (1.0, 0.0), (1.0, 45.0), (1.0, 90.0))
-    )
-    np.testing.assert_allclose(s + p, 2.0 * none, rtol=1e-12, atol=1e-12 * none[0] + 1e-300)
-    return np.stack([none, 0.5 * (s - p), diagonal - none], axis=1)
-
-
 @pytest.mark.thorough
 @each("view", [(0.0, 20.0), (40.0, 20.0), (85.0, 20.0), (40.0, 200.0)], ids=str)
 @each("dtype", [np.float64, np.float32])
@@ -117,7 +97,7 @@ def test_derivatives_exist_where_viewer_and_light_coincide(view: tuple, dtype: t
     """The gradient over both directions, the polarization and the index; and it is a limit."""
 
     def reading(row: jax.Array) -> jax.Array:
-        parameters = {"refractive_index": row[4], "degree": row[5], "angle": row[6]}
+        parameters = {"refractive_index": row[4], "light_degree": row[5], "light_angle": row[6]}
         geometry = Geometry(*(row[i : i + 1] for i in range(4)))
         return MIRROR.stokes(parameters, geometry)[0] @ jnp.asarray([0.3, 1.0, -0.7], dtype)
 
@@ -134,9 +114,7 @@ def test_derivatives_exist_where_viewer_and_light_coincide(view: tuple, dtype: t
 @pytest.mark.thorough
 @given(incidence=zenith, n=index, degree=degree, angle=angle)
 @RUN
-def test_what_enters_is_what_the_transmittances_of_s_and_p_let_through(
-    incidence: float, n: float, degree: float, angle: float
-) -> None:
+def test_what_enters_is_what_the_transmittances_of_s_and_p_let_through(incidence, n, degree, angle):
     b = float(np.sin(np.deg2rad(incidence)) ** 2)
     _, fields, (s, p) = twin.films(1.0, (), n, b)
     # The product of both fields grows in power as each does.

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import each
+from optics import directions
 
 from polar_bayes.physics.facets import FacetQuadrature
-from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.scene import SCENES
 
 ZENITHS = np.linspace(2.0, 85.0, 43)
@@ -24,9 +24,7 @@ def test_twenty_facets_are_as_good_as_four_hundred(name: str) -> None:
         scene,
         surface=dataclasses.replace(scene.surface, quadrature=FacetQuadrature(along=20, across=20)),
     )
-    geometry = Geometry.from_degrees(
-        view_zenith=ZENITHS, view_azimuth=150.0, light_zenith=45.0, light_azimuth=0.0
-    )
+    geometry = directions(ZENITHS, 150.0, 45.0)
 
     def predict(scene, roughness):
         parameters = {

@@ -6,58 +6,37 @@ import numpy as np
 import pytest
 import vector_optics as twin
 from cases import each
-from hypothesis import settings
-from hypothesis import strategies as st
+from optics import DISTRIBUTIONS, GROOVED, directions, stokes_of
 
 from polar_bayes.physics.facets import FacetQuadrature
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.physics.illumination import Disc, PointSource, UniformSky
-from polar_bayes.physics.microfacet import (
-    GGX,
-    AnisotropicSlopes,
-    Beckmann,
-    HeightCorrelatedShadowing,
-    IsotropicSlopes,
-)
+from polar_bayes.physics.microfacet import GGX, HeightCorrelatedShadowing, IsotropicSlopes
 from polar_bayes.physics.mixing import StokesMixing
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.stack import Stack
 from polar_bayes.physics.subsurface import Lambertian
 from polar_bayes.physics.surface import RoughSurface
 
-RUN = settings(deadline=None, max_examples=40, derandomize=True)
-zenith = st.floats(0.0, 89.0)
-azimuth = st.floats(-180.0, 180.0)
-roughness = st.floats(0.02, 1.0)
-stokes_of = jax.jit(Scene.stokes, static_argnums=0)
-DISTRIBUTIONS = {"Beckmann": Beckmann(), "GGX": GGX()}
-ALONG = AnisotropicSlopes("roughness_azimuth")
 
-
-def scene(source: object, slopes: object, distribution: object = None, **parts: object) -> Scene:
+def scene(source: object, slopes: object, distribution: object = None) -> Scene:
     """Surface and body, so that the way out is seen, too."""
-    surface = RoughSurface(distribution or GGX(), source, slopes=slopes, **parts)
+    surface = RoughSurface(distribution or GGX(), source, slopes=slopes)
     return Scene(surface, Lambertian(0.5), StokesMixing())
 
 
-POINT = scene(PointSource(), ALONG)
 SOURCES = each(
     "source", [PointSource(), Disc(20.0), UniformSky()], ids=["point", "disc", "sky"], quick=1
 )
-VIEWS = {
-    "view_zenith": np.array([0.0, 30.0, 60.0, 80.0]),
-    "view_azimuth": np.array([0.0, 20.0, -70.0, 160.0]),
-    "light_zenith": np.array([10.0, 40.0, 60.0, 80.0]),
-    "light_azimuth": np.array([180.0, 230.0, 100.0, 10.0]),
-}
 
 
 def seen(turn: float = 0.0, sign: float = 1.0) -> Geometry:
     """The views turned about the normal, or mirrored at the plane of azimuth 0."""
-    angles = {
-        name: sign * angle + turn if "azimuth" in name else angle for name, angle in VIEWS.items()
-    }
-    return Geometry(**{name: jnp.asarray(angle) for name, angle in angles.items()})
+    view_azimuth, light_azimuth = np.array([[0.0, 20, -70, 160], [180.0, 230, 100, 10]])
+    zeniths = [0.0, 30.0, 60.0, 80.0], [10.0, 40.0, 60.0, 80.0]
+    return directions(
+        zeniths[0], sign * view_azimuth + turn, zeniths[1], sign * light_azimuth + turn
+    )
 
 
 def material(along: float, across: float, turn: float = 0.0) -> dict[str, float]:
@@ -81,47 +60,38 @@ def test_equal_roughnesses_are_isotropic(source: object, name: str) -> None:
     same = material(0.3, 0.3, 37.0)
     both, one = (
         stokes_of(scene(source, slopes, DISTRIBUTIONS[name]), same, seen())
-        for slopes in (ALONG, IsotropicSlopes())
+        for slopes in (GROOVED, IsotropicSlopes())
     )
     np.testing.assert_allclose(both[:, 0], one[:, 0], rtol=3e-3)
     np.testing.assert_allclose(both[:, 1:] / one[:, :1], one[:, 1:] / one[:, :1], atol=3e-3)
 
 
 @SOURCES
-def test_a_right_angle_turns_one_roughness_into_the_other(source: object) -> None:
-    one = stokes_of(scene(source, ALONG), material(0.4, 0.15, 25.0), seen())
-    other = stokes_of(scene(source, ALONG), material(0.15, 0.4, 115.0), seen())
-    np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-14)
-
-
-@SOURCES
-def test_a_mirror_image_has_the_other_sign_of_u(source: object) -> None:
-    here = stokes_of(scene(source, ALONG), material(0.4, 0.15, 25.0), seen())
-    there = stokes_of(scene(source, ALONG), material(0.4, 0.15, -25.0), seen(sign=-1.0))
-    np.testing.assert_allclose(there, here * np.array([1.0, 1.0, -1.0]), rtol=1e-11, atol=1e-14)
+def test_turned_grooves_have_the_other_roughness_and_mirrored_ones_the_other_sign_of_u(source):
+    found = scene(source, GROOVED)
+    here = stokes_of(found, material(0.4, 0.15, 25.0), seen())
+    turned = stokes_of(found, material(0.15, 0.4, 115.0), seen())
+    np.testing.assert_allclose(turned, here, rtol=1e-11, atol=1e-14)
+    image = stokes_of(found, material(0.4, 0.15, -25.0), seen(sign=-1.0))
+    np.testing.assert_allclose(image, here * np.array([1.0, 1.0, -1.0]), rtol=1e-11, atol=1e-14)
     assert np.max(np.abs(here[:, 2] / here[:, 0])) > 0.01
 
 
-# Roughness along, across, its azimuth, and the view zenith; the last three are ten times as steep.
-GROOVES = np.array(
-    [
-        (*grooves, view)
-        for grooves in ((0.3, 0.1, 20.0), (0.1, 0.4, -50.0), (0.5, 0.05, 90.0))
-        for view in (20.0, 60.0, 82.0)
-    ]
-)
+GROOVES = [(0.3, 0.1, 20.0), (0.1, 0.4, -50.0), (0.5, 0.05, 90.0)]
+"""Roughness along, across, and its azimuth; the last are ten times as steep."""
 
 
 @pytest.mark.thorough
 @each("name", DISTRIBUTIONS)
 def test_sky_and_way_out_agree_with_brute_force(name: str) -> None:
     """360,000 facets by vectors, to 1e-5, against 30 x 30; and what the default costs."""
-    along, across, turn, view = (jnp.asarray(column)[:, None] for column in GROOVES.T)
+    rows = np.array([(*grooves, view) for grooves in GROOVES for view in (20.0, 60.0, 82.0)])
+    along, across, turn, view = (jnp.asarray(column)[:, None] for column in rows.T)
     geometry = Geometry(view, jnp.full_like(view, 30.0), view, jnp.zeros_like(view))
     parameters = {"roughness": along, "roughness_across": across, "roughness_azimuth": turn}
     stack = Stack(jnp.array([1.5]))
     skies, exits = [], []
-    for row in GROOVES:
+    for row in rows:
         population = twin.Population(name, *row[:3], steps=600)
         skies.append(population.sky(row[3], 30.0, 1.5, correlated=True))
         exits.append(population.way_out(row[3], 30.0, 1.5))
@@ -131,7 +101,7 @@ def test_sky_and_way_out_agree_with_brute_force(name: str) -> None:
         (FacetQuadrature(), 2.0 * stated, stated),
     ):
         surface = RoughSurface(
-            DISTRIBUTIONS[name], UniformSky(), quadrature, ALONG, HeightCorrelatedShadowing()
+            DISTRIBUTIONS[name], UniformSky(), quadrature, GROOVED, HeightCorrelatedShadowing()
         )
         mirrored, leaving = jax.jit(
             lambda p, surface=surface: (
@@ -157,7 +127,7 @@ def test_the_default_serves_steep_grooves_from_any_side(name: str) -> None:
     stack = Stack(jnp.array([1.5]))
 
     def light(quadrature: FacetQuadrature) -> list:
-        surface = RoughSurface(DISTRIBUTIONS[name], UniformSky(), quadrature, ALONG)
+        surface = RoughSurface(DISTRIBUTIONS[name], UniformSky(), quadrature, GROOVED)
         return [
             surface.light(parameters, geometry, stack),
             surface.exit(parameters, geometry, stack),
@@ -172,7 +142,7 @@ def test_the_default_serves_steep_grooves_from_any_side(name: str) -> None:
 
 
 @each("name", DISTRIBUTIONS)
-@each("slopes", [IsotropicSlopes(), ALONG], ids=["isotropic", "grooves"], quick=1)
+@each("slopes", [IsotropicSlopes(), GROOVED], ids=["isotropic", "grooves"], quick=1)
 def test_facets_of_a_smooth_surface_sum_to_one(name: str, slopes: object) -> None:
     """Under a sky a surface as smooth as can be is a mirror; nodes of GGX were .0015 short."""
     views = jnp.array([0.0, 30.0, 56.0, 80.0])

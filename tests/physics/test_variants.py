@@ -10,13 +10,7 @@ import polar_bayes as pb
 from polar_bayes.physics.instrument import AbstractInstrumentTerm
 from polar_bayes.physics.part import Part
 from polar_bayes.physics.scene import FULL_SCENES
-from polar_bayes.physics.variants import (
-    effects_of,
-    find_effects,
-    parts_of,
-    simplify,
-    unseen_layers,
-)
+from polar_bayes.physics.variants import effects_of, find_effects, parts_of, simplify, unseen_layers
 from polar_bayes.setups import SETUPS
 
 ROUGH = pb.Scene(
@@ -135,9 +129,7 @@ def test_what_holds_nothing_any_more_is_left_out_too() -> None:
         (ROUGH, []),
     ],
 )
-def test_layers_that_nobody_sees_are_offered_where_a_scene_has_nothing(
-    scene: pb.Scene, layers: list[str]
-) -> None:
+def test_layers_that_nobody_sees_are_offered_where_a_scene_has_nothing(scene, layers) -> None:
     offered = unseen_layers(scene, has_wavelength=True)
     assert [each.name for each in offered] == layers
     for each_layer in offered:
