@@ -25,9 +25,6 @@ LINKS = {"q": pb.links.StokesLink()}
 ROUGHLY = pb.benchmark.Reference(error=0.05, longer=0)
 
 
-pytestmark = pytest.mark.usefixtures("compiled_in_haste")
-
-
 @dataclasses.dataclass(frozen=True)
 class Biased(AbstractMethod):
     """Draws of the exact posterior of the line, moved by so many standard deviations."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any, override
 
 import jax
@@ -10,7 +11,8 @@ import numpyro
 import pytest
 import xarray as xr
 from numpyro import distributions as dist
-from plates import GONIOMETER, GONIOMETER_VIEWS, LINKS, PLATE, plate_capture, plates
+from plates import GONIOMETER, GONIOMETER_VIEWS, LINKS, ON_PLATE, PLATE, plate_capture, plates
+from synthetic_calibrations import assert_held_as_stated
 from toy_models import line
 
 import polar_bayes as pb
@@ -43,7 +45,8 @@ def population_of(noise: float) -> Callable:
 
 
 population, too_sure = population_of(NOISE), population_of(NOISE / 2.0)
-ASKED: dict[str, Any] = {"scene": PLATE, "links": LINKS, "readings": False}
+ASKED: dict[str, Any] = ON_PLATE | {"readings": False}
+OF_PATCHES = ASKED | {"model": population, "method": pb.methods.Laplace(draws=200, chains=1)}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -61,8 +64,7 @@ def capture() -> xr.Dataset:
 
 @pytest.fixture(scope="module")
 def exact(capture: xr.Dataset) -> xr.DataTree:
-    laplace = pb.methods.Laplace(draws=200, chains=1)
-    return pb.calibrate(capture, simulations=COUNT, model=population, method=laplace, **ASKED)
+    return pb.calibrate(capture, simulations=COUNT, **OF_PATCHES)
 
 
 @pytest.mark.thorough
@@ -73,10 +75,7 @@ def test_an_exact_method_passes_patch_by_patch(exact: xr.DataTree) -> None:
     p_values = table.filter(like="p_")
     assert p_values.min(axis=None) > 1e-3 / p_values.size
     assert (table["answered"] == COUNT).all()
-    for percent in (50, 80, 95):
-        share = percent / 100.0
-        error = np.sqrt(share * (1.0 - share) / COUNT)
-        assert np.abs(table[f"held_{percent}"] - share).max() < 3.3 * error
+    assert_held_as_stated(table, COUNT)
     assert exact["truth"]["level"].dims == ("simulation", "patch")
     assert (exact["fits"]["status"] == Status.GOOD).all()
     assert (exact["fits"]["method"] == MethodUsed.LAPLACE).all()
@@ -84,8 +83,7 @@ def test_an_exact_method_passes_patch_by_patch(exact: xr.DataTree) -> None:
 
 @pytest.mark.thorough
 def test_a_model_that_is_too_sure_is_caught(capture: xr.Dataset) -> None:
-    laplace, told = pb.methods.Laplace(draws=200, chains=1), {"model": population}
-    asked = {"model": too_sure, "method": laplace, "truth": told, **ASKED}
+    asked = OF_PATCHES | {"model": too_sure, "truth": {"model": population}}
     table = pb.summary(pb.calibrate(capture, simulations=40, **asked))
     assert not pb.calibration.is_calibrated(table)
     assert (table["rank_spread"].drop("location") > 1.0).all()
@@ -93,8 +91,7 @@ def test_a_model_that_is_too_sure_is_caught(capture: xr.Dataset) -> None:
 
 @pytest.mark.thorough
 def test_a_fit_does_not_depend_on_how_many_there_are(capture, exact):
-    laplace = pb.methods.Laplace(draws=200, chains=1)
-    few = pb.calibrate(capture, simulations=22, model=population, method=laplace, **ASKED)
+    few = pb.calibrate(capture, simulations=22, **OF_PATCHES)
     for group in ("truth", "prior_sbc", "marginals"):
         some = exact[group].to_dataset().isel(simulation=slice(22))
         xr.testing.assert_identical(few[group].to_dataset(), some)
@@ -119,22 +116,19 @@ def test_fits_without_draws_are_counted(capture, monkeypatch):
     inner = problem.CompiledModel.initializer.func
     refused = []
 
-    class Refusing:
-        def __init__(self, initializer) -> None:
-            self._grounds = initializer
-            self.is_joint = initializer.is_joint
+    def refusing(model):
+        initializer = inner(model)
 
-        def find(self, data, *further):
+        def find(data, *further):
             if float(data.readings["q"].mean()) > 0.0:
                 refused.append(None)
                 raise FitError("no start reached a peak", where="fit", hint="look at it")
-            return self._grounds.find(data, *further)
+            return initializer.find(data, *further)
 
-    monkeypatch.setattr(
-        problem.CompiledModel, "initializer", property(lambda self: Refusing(inner(self)))
-    )
-    laplace = pb.methods.Laplace(draws=50, chains=1)
-    found = pb.calibrate(capture, simulations=24, model=population, method=laplace, **ASKED)
+        return SimpleNamespace(find=find, is_joint=initializer.is_joint)
+
+    monkeypatch.setattr(problem.CompiledModel, "initializer", property(refusing))
+    found = pb.calibrate(capture, simulations=24, **OF_PATCHES)
     lost = found["fits"]["status"].to_numpy() == Status.NOT_CONVERGED
     assert 0 < lost.sum() == len(refused) < 24
     assert np.array_equal(np.isnan(found["prior_sbc"]["location"].to_numpy()), lost)

@@ -22,8 +22,6 @@ from polar_bayes.observation.distributions import MeanConcentrationBeta, SensorS
 from polar_bayes.physics.geometry import Geometry
 from polar_bayes.reporting.report import render
 
-pytestmark = pytest.mark.usefixtures("compiled_in_haste")
-
 METHOD = pb.methods.CorrectedLaplace(sampler=None)
 KNOWN = {**ASKED, "method": METHOD}
 INFERRED = {**KNOWN, "model": "per_material"}
@@ -69,12 +67,12 @@ def contradicted(maps: xr.Dataset, kind: str) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def known(compiled_in_haste: None) -> xr.Dataset:
+def known() -> xr.Dataset:
     return pb.fit_pixels(kinds_image(), **KNOWN)
 
 
 @pytest.fixture(scope="module")
-def inferred(compiled_in_haste: None) -> xr.Dataset:
+def inferred() -> xr.Dataset:
     return pb.fit_pixels(kinds_image(), **INFERRED)
 
 

@@ -22,9 +22,6 @@ from polar_bayes.inference.scoring import exact_derivatives, scoring_derivatives
 from polar_bayes.models.per_material import per_material
 from polar_bayes.observation.data import Observations, observe
 
-pytestmark = pytest.mark.usefixtures("compiled_in_haste")
-
-
 PRIORS = {
     "subsurface_fraction": dist.Beta(2.0, 2.0),
     "refractive_index": dist.TruncatedNormal(1.45, 0.15, low=1.2, high=2.0),

@@ -18,8 +18,6 @@ from polar_bayes.methods import importance
 from polar_bayes.methods.method import AbstractMethod
 from polar_bayes.reporting.text import METHODS_USED
 
-pytestmark = pytest.mark.usefixtures("compiled_in_haste")
-
 
 @pytest.fixture(scope="module")
 def image() -> xr.Dataset:
@@ -27,7 +25,7 @@ def image() -> xr.Dataset:
 
 
 @pytest.fixture(scope="module")
-def weighted(image: xr.Dataset, compiled_in_haste: None) -> xr.Dataset:
+def weighted(image: xr.Dataset) -> xr.Dataset:
     return pb.fit_pixels(image, method="importance", **ASKED)
 
 

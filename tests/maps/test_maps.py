@@ -27,8 +27,6 @@ from polar_bayes.methods.laplace import Laplace
 from polar_bayes.models.per_material import per_material
 from polar_bayes.physics.facets import FacetQuadrature
 
-pytestmark = pytest.mark.usefixtures("compiled_in_haste")
-
 INTERVALS = {"50%": (0.25, 0.75), "80%": (0.1, 0.9), "95%": (0.025, 0.975)}
 
 
@@ -38,7 +36,7 @@ def image() -> xr.Dataset:
 
 
 @pytest.fixture(scope="module")
-def plan(image: xr.Dataset, compiled_in_haste: None) -> MapPlan:
+def plan(image: xr.Dataset) -> MapPlan:
     return planned(image)
 
 

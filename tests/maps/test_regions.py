@@ -19,7 +19,6 @@ from polar_bayes.inference.batching import Status
 
 SIDE, NOISE, SPREAD, ZERO = 16, 0.05, 0.1, 0.07
 PRIORS = {"dark_level": dist.Normal(0.0, 0.3)}
-pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 
 
 def above_zero(data, scene, priors, links) -> None:
@@ -46,7 +45,7 @@ def image() -> xr.Dataset:
 
 
 @pytest.fixture(scope="module")
-def maps(image: xr.Dataset, compiled_in_haste: None) -> xr.Dataset:
+def maps(image: xr.Dataset) -> xr.Dataset:
     asked = ASKED | {"model": above_zero, "priors": PRIORS}
     return pb.fit_pixels(image, shared="dark_level", **asked)
 

@@ -20,7 +20,6 @@ SIDE = 15
 LINKS = {"q": pb.links.StokesLink(stated_errors=True)}
 HALVES = np.where(np.arange(SIDE) < SIDE // 2, 0.8, 2.4) * np.ones((SIDE, 1))
 """The noise of the right half is three times that of the left one."""
-pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 
 
 def noisy(factor: float | np.ndarray, seed: int = 4) -> xr.Dataset:
@@ -36,7 +35,7 @@ def image() -> xr.Dataset:
 
 
 @pytest.fixture(scope="module")
-def maps(image: xr.Dataset, compiled_in_haste: None) -> xr.Dataset:
+def maps(image: xr.Dataset) -> xr.Dataset:
     return pb.fit_pixels(image, scene=PLATE, links=LINKS, shared=SHARED)
 
 

@@ -26,7 +26,7 @@ LINKS, KEY = {"q": pb.links.StokesLink()}, jax.random.key(0)
 
 
 @pytest.fixture(autouse=True)
-def few_prior_draws(compiled_in_haste: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def few_prior_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fitting, "PRIOR_DRAWS", 20)
 
 
