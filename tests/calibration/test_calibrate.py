@@ -113,18 +113,15 @@ def test_simulations_are_the_same_whatever_is_off_and_however_many_there_are(cap
         xr.testing.assert_identical(bare[name].to_dataset(), some)
 
 
-@each(
-    ("asked", "said"),
-    [
+def test_mistakes_are_told(capture: xr.Dataset) -> None:
+    for asked, said in (
         ({"simulations": 5}, "simulations is 5; give 20 or more"),
         ({"method": "point"}, "point gives no draws of many captures"),
         ({"method": "hmc"}, "no such method; give one of laplace, importance, "),
         ({"truth": {"seed": 1}}, "seed cannot differ"),
-    ],
-)
-def test_mistakes_are_told(capture: xr.Dataset, asked: dict, said: str) -> None:
-    with pytest.raises(pb.FitError, match=said):
-        pb.calibrate(capture, **ASKED | asked)
+    ):
+        with pytest.raises(pb.FitError, match=said):
+            pb.calibrate(capture, **ASKED | asked)
     with pytest.raises(pb.FitError, match="it holds no fit; give the tree"):
         pb.summary(xr.DataTree())
 
