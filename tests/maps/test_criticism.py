@@ -191,7 +191,7 @@ NOISES = {
 @each("name", NOISES)
 def test_normal_scores_of_readings_are_normal(name: str) -> None:
     with jax.enable_x64(True):
-        value = NOISES[name].sample(jax.random.key(3), (5000,))
+        value = jax.jit(lambda key: NOISES[name].sample(key, (5000,)))(jax.random.key(3))
         value = value[value < 1.0] if name == "sensor" else value
         noise = dist.MaskedDistribution(NOISES[name].expand(value.shape), jnp.array(True))
         found = standardize(noise, value)
