@@ -130,6 +130,8 @@ def test_as_many_draws_are_needed_as_the_tolerance_says():
     assert quantile(1) == pytest.approx(2.5758, abs=1e-4)
     assert draws_needed(0.1, 3) == int(np.ceil((quantile(6) / 0.1) ** 2))
     assert draws_needed(0.05, 3) == pytest.approx(4 * draws_needed(0.1, 3), abs=4)
+    rungs = pb.methods.Auto(tolerance=0.1).candidates(problem(line))
+    assert rungs["importance"].draws == 16 * draws_needed(0.1, 2)
 
 
 def test_draws_that_are_no_numbers_have_an_infinite_error():
@@ -146,14 +148,6 @@ def test_draws_are_scaled_and_settings_kept():
     assert (chains.draws, chains.most_draws, chains.ess) == (1000, 16000, 900.0)
     assert chains.warmup == 77
     assert pb.methods.Point().scale_draws(2.0) is None
-
-
-@pytest.mark.thorough
-def test_the_automatic_choice_asks_for_as_many_draws_as_it_needs():
-    auto, here = pb.methods.Auto(tolerance=0.1), problem(line)
-    needed = draws_needed(0.1, 2)
-    rungs = auto.candidates(here)
-    assert rungs["importance"].draws == 16 * needed
 
 
 @each(
