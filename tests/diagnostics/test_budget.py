@@ -190,7 +190,9 @@ def test_what_cannot_be_known_is_refused(fit, capture, known: dict, message: str
     for what, door in doors.items():
         with pytest.raises(pb.FitError, match=f"^{re.escape(message.format(what))}"):
             door()
-    with pytest.raises(pb.FitError, match="capture: sample_lean_uncertainty: it is 'by eye'; give"):
+    with pytest.raises(
+        pb.FitError, match="capture: sample_lean_uncertainty: it is 'by eye'; give a"
+    ):
         pb.fit(capture.assign_attrs(sample_lean_uncertainty="by eye"), **ASKED)
 
 

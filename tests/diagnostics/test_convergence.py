@@ -85,6 +85,8 @@ def weighted(log_weight):
 EVEN = np.random.default_rng(0).normal(0.0, 0.01, (4, 1000))
 LAPLACE = {"method": "laplace", "draws": 1000}
 WEIGHTED = "The effective sample size of the weighted draws is 399 \\(at least 400\\)"
+EDGE = "readings of dop lie at the edge"
+MASKED = "40 of 100 readings are marked valid=False"
 JUDGED: list[tuple] = [
     # A layout, what is done to the result, the list that tells of it, and the words.
     ({}, {}, None, "R-hat"),
@@ -103,10 +105,20 @@ JUDGED: list[tuple] = [
     ({}, {"scene_chosen_by": "default"}, "cautions", "^No set-up was stated, so 'paper' was used"),
     ({}, {"capture_cautions": ["Swapped."]}, "cautions", "^Swapped.$"),
     ({}, {"modes": {"weights": [0.9, 0.1]}}, "cautions", "another mode, of weight 0.1"),
-    ({}, {"counts": {"views": 100, "masked": 40}}, "cautions", "40 of 100 readings are marked val"),
-    ({}, {"counts": {"views": 8, "at_margin": {"dop": 3}}}, "cautions", "3 readings of dop lie at"),
+    ({}, {"counts": {"views": 100, "masked": 40}}, "cautions", MASKED),
+    (
+        {},
+        {"counts": {"views": 8, "at_margin": {"dop": 3}}},
+        "cautions",
+        f"3 {EDGE}",
+    ),
     # A mirror has a degree of polarization of 1 at Brewster's angle.
-    ({}, {"counts": {"views": 40, "at_margin": {"dop": 2}}}, "findings", "2 of 40 readings of dop"),
+    (
+        {},
+        {"counts": {"views": 40, "at_margin": {"dop": 2}}},
+        "findings",
+        f"2 of 40 {EDGE}",
+    ),
     ({}, deep(5), None, "of 1000 draws reached"),
     ({}, deep(50), "findings", "50 of 1000 draws reached"),
     ({"method": "point"}, {}, "cautions", "^No standard error: exposure;"),

@@ -126,6 +126,9 @@ def test_maps_that_are_still_to_be_computed_are_computed_once(monkeypatch):
         coverage_of(lazy, SPREAD)
 
 
+DIFFER = r"different axes \(y 50 x x 40 and y 40 x x 50\)"
+
+
 @each(
     ("truth", "error", "words"),
     [
@@ -133,7 +136,7 @@ def test_maps_that_are_still_to_be_computed_are_computed_once(monkeypatch):
         (
             {"roughness": SPREAD.T},
             pb.CaptureError,
-            r"different axes \(y 50 x x 40 and y 40",
+            DIFFER,
         ),
         (None, pb.FitError, "it holds no maps"),
     ],

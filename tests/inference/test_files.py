@@ -280,7 +280,9 @@ def test_other_kinds_of_tree_are_named(tmp_path):
         pb.diagnostics.population_summary,
     ):
         for wrong in (CALIBRATION, xr.Dataset(), None, "fit.nc"):
-            with pytest.raises(pb.FitError, match=r"it holds no (fit|readings); give the tree"):
+            with pytest.raises(
+                pb.FitError, match=r"it holds no (fit|readings); give the tree that"
+            ):
                 function(wrong)
     odd = MANY.copy()
     odd.attrs["what"] = {"a": 1}

@@ -17,8 +17,6 @@ from polar_bayes.models.per_material import per_material
 SHARED = ("stokes_error_factor",)
 FACTOR = 1.6
 SIDE = 15
-METHOD = pb.methods.CorrectedLaplace(sampler=None)
-ASKED = ON_PLATE | {"method": METHOD}
 HALVES = np.where(np.arange(SIDE) < SIDE // 2, 0.8, 2.4) * np.ones((SIDE, 1))
 """The noise of the right half is three times that of the left one."""
 
@@ -37,7 +35,7 @@ def image() -> xr.Dataset:
 
 @pytest.fixture(scope="module")
 def maps(image: xr.Dataset) -> xr.Dataset:
-    return pb.fit_pixels(image, **ASKED, shared=SHARED)
+    return pb.fit_pixels(image, **ON_PLATE, shared=SHARED)
 
 
 def test_the_noise_of_an_image_is_one_number(image: xr.Dataset, maps: xr.Dataset) -> None:
@@ -58,7 +56,7 @@ def test_the_noise_of_an_image_is_one_number(image: xr.Dataset, maps: xr.Dataset
 @pytest.mark.thorough
 def test_pixels_know_as_much_as_if_the_noise_were_given(image, maps):
     held = handlers.condition(per_material, data={"stokes_error_factor": FACTOR})
-    given = pb.fit_pixels(image, model=held, **ASKED)
+    given = pb.fit_pixels(image, model=held, **ON_PLATE)
     for name in ("refractive_index", "subsurface_fraction"):
         ratio = maps[f"{name}_sd"] / given[f"{name}_sd"]
         # The scale differs from the truth by at most 3.5 of its sds of 2.4%.
@@ -66,7 +64,7 @@ def test_pixels_know_as_much_as_if_the_noise_were_given(image, maps):
 
 
 def test_pixels_that_disagree_are_told() -> None:
-    maps = pb.fit_pixels(noisy(HALVES), **ASKED, shared=SHARED)
+    maps = pb.fit_pixels(noisy(HALVES), **ON_PLATE, shared=SHARED)
     (sentence,) = pb.maps.shared_cautions(maps)
     assert "stokes_error_factor is shared by all pixels, and they do not agree" in sentence
 
@@ -75,10 +73,10 @@ def test_pixels_that_disagree_are_told() -> None:
 def test_it_does_not_matter_how_the_image_is_cut(image, maps, tmp_path):
     paths = tmp_path / "image.zarr", tmp_path / "map.zarr"
     image.chunk(y=4, x=8).to_zarr(paths[0], consolidated=False)
-    stored = pb.maps.map_file(*paths, **ASKED, shared=SHARED)
+    stored = pb.maps.map_file(*paths, **ON_PLATE, shared=SHARED)
     for name in maps.data_vars:
         np.testing.assert_array_equal(stored[name], maps[name], err_msg=str(name))
-    resumed = pb.maps.map_file(*paths, **ASKED, shared=SHARED, resume=True)
+    resumed = pb.maps.map_file(*paths, **ON_PLATE, shared=SHARED, resume=True)
     xr.testing.assert_identical(resumed.load(), stored.load())
     page = pb.report(stored, tmp_path / "report").read_text()
     assert "What all pixels have in common" in page
@@ -87,7 +85,7 @@ def test_it_does_not_matter_how_the_image_is_cut(image, maps, tmp_path):
 @pytest.mark.thorough
 def test_masked_pixels_say_nothing_about_what_is_shared(image: xr.Dataset) -> None:
     holes = image.assign(q=image["q"].where((image["y"] % 2 == 0) | (image["x"] % 3 > 0)))
-    maps = pb.fit_pixels(holes, **ASKED, shared=SHARED)
+    maps = pb.fit_pixels(holes, **ON_PLATE, shared=SHARED)
     masked = int((maps["status"] == Status.MASKED).sum())
     assert masked == int(holes["q"].isnull().all("view").sum())
     found = pb.maps.shared_parameters(maps).loc["stokes_error_factor"]
@@ -104,7 +102,7 @@ def test_masked_pixels_say_nothing_about_what_is_shared(image: xr.Dataset) -> No
 )
 def test_what_cannot_be_shared_is_refused(image, columns: int, shared: object, what: str) -> None:
     with pytest.raises(pb.FitError, match=what):
-        pb.fit_pixels(image.isel(x=slice(columns)), **ASKED, shared=shared)
+        pb.fit_pixels(image.isel(x=slice(columns)), **ON_PLATE, shared=shared)
 
 
 SETUP = pb.setups.Setup(PLATE, LINKS, priors=pb.setups.SETUPS["paper"].priors, shared=SHARED)
@@ -112,7 +110,7 @@ SETUP = pb.setups.Setup(PLATE, LINKS, priors=pb.setups.SETUPS["paper"].priors, s
 
 def test_a_setup_says_what_its_images_share(image, maps, monkeypatch):
     monkeypatch.setattr(fit_map, "SHARED_PIXELS", SIDE**2)
-    found = pb.fit_pixels(image, scene=SETUP, method=METHOD)
+    found = pb.fit_pixels(image, scene=SETUP)
     xr.testing.assert_equal(found, maps)
     assert not pb.maps.shared_cautions(found)
 
@@ -121,12 +119,12 @@ def test_a_setup_says_what_its_images_share(image, maps, monkeypatch):
 def test_pixels_keep_their_own_where_nothing_should_be_shared(tmp_path, monkeypatch):
     """In a small image, where the caller says so, and where pixels disagree, which is told."""
     image = noisy(HALVES)
-    small = pb.fit_pixels(image, scene=SETUP, method=METHOD)
+    small = pb.fit_pixels(image, scene=SETUP)
     monkeypatch.setattr(fit_map, "SHARED_PIXELS", SIDE**2)
-    asked = pb.fit_pixels(image, scene=SETUP, method=METHOD, shared=())
+    asked = pb.fit_pixels(image, scene=SETUP, shared=())
     image.to_zarr(tmp_path / "image.zarr", consolidated=False)
     paths = tmp_path / "image.zarr", tmp_path / "map.zarr"
-    disagreeing = pb.maps.map_file(*paths, scene=SETUP, method=METHOD).load()
+    disagreeing = pb.maps.map_file(*paths, scene=SETUP).load()
     for maps in (small, asked, disagreeing):
         assert pb.maps.shared_parameters(maps).empty
         for name in ("stokes_error_factor", "refractive_index_sd"):
@@ -134,7 +132,7 @@ def test_pixels_keep_their_own_where_nothing_should_be_shared(tmp_path, monkeypa
     assert not pb.maps.shared_cautions(small) + pb.maps.shared_cautions(asked)
     (caution,) = pb.maps.shared_cautions(disagreeing)
     assert "one value should serve the whole image, but pixels do" in caution
-    again = pb.maps.map_file(*paths, scene=SETUP, method=METHOD, resume=True)
+    again = pb.maps.map_file(*paths, scene=SETUP, resume=True)
     xr.testing.assert_identical(again.load(), disagreeing)
 
 

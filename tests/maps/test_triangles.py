@@ -21,7 +21,7 @@ def positive(rng: np.random.Generator, size: int, condition: float, count: int =
     return 0.5 * (matrix + matrix.swapaxes(-1, -2))
 
 
-@each("dtype", [np.float32, np.float64], quick=1)
+@each("dtype", [np.float64, np.float32], quick=1)
 @each("size", SIZES)
 def test_factors_and_inverses_are_those_of_numpy(size: int, dtype: type) -> None:
     matrix = positive(np.random.default_rng(size), size, 100.0).astype(dtype)
