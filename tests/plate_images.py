@@ -1,9 +1,9 @@
 """Images of smooth plates whose truth is drawn from the priors: textbook optics, NumPy only."""
 
+import jax
 import numpy as np
 import xarray as xr
-from numpyro import handlers
-from plates import PLATE, at_mirror
+from plates import KNOWN, LINKS, PLATE, at_mirror
 from scipy import stats
 from textbook import plate_q
 
@@ -19,7 +19,6 @@ from polar_bayes.maps.fit_map import (
     plan_map,
     with_pixel_numbers,
 )
-from polar_bayes.models.per_material import per_material
 
 NOISE = 0.02
 # Away from Brewster's angle q stays so far from -1 that ordinary noise is never clipped.
@@ -28,12 +27,7 @@ NAMES = ("refractive_index", "subsurface_fraction")
 
 # A plate read by q with normal noise as large as each pixel says: two parameters. A set-up of its
 # own has the priors from which the truth is drawn.
-LINKS = {"q": pb.links.StokesLink(stated_errors=True)}
-ASKED = {
-    "model": handlers.condition(per_material, data={"stokes_error_factor": 1.0}),
-    "scene": pb.setups.Setup(PLATE, LINKS),
-    "links": LINKS,
-}
+ASKED = {**KNOWN, "scene": pb.setups.Setup(PLATE, LINKS)}
 
 
 def plate_image(rows, columns, *, noise=NOISE, views=VIEWS, seed=0):
@@ -83,6 +77,15 @@ def planned(capture, method=None, *, seed=0, precision="double", **asked):
 def stacked(capture: xr.Dataset, plan: MapPlan) -> ProblemBatch:
     """The pixels of an image in a row."""
     return plan.batch(mask_missing(capture))
+
+
+def backwards(potential):
+    """Value, gradient and Hessian of a potential as JAX finds them."""
+    return lambda z, data: (
+        potential(z, data),
+        jax.grad(potential)(z, data),
+        jax.hessian(potential)(z, data),
+    )
 
 
 def mapped(capture: xr.Dataset, plan: MapPlan, block: int = 4096) -> xr.Dataset:

@@ -2,12 +2,17 @@
 
 import numpy as np
 import xarray as xr
+from numpyro import handlers
 from textbook import plate_q
 
 import polar_bayes as pb
+from polar_bayes.models.per_material import per_material
 
 PLATE = pb.Scene(surface=pb.SmoothSurface(), subsurface=pb.Unpolarized(), mixing=pb.StokesMixing())
 LINKS = {"q": pb.links.StokesLink(stated_errors=True)}
+ON_PLATE = {"scene": PLATE, "links": LINKS}
+KNOWN = ON_PLATE | {"model": handlers.condition(per_material, data={"stokes_error_factor": 1.0})}
+"""What is asked of a plate, with a factor on its stated errors or with errors that are known."""
 
 GONIOMETER = {"scene": "goniometer", "links": pb.setups.SETUPS["goniometer"].links}
 GONIOMETER_VIEWS = np.arange(12.0, 79.0, 3.0)

@@ -92,6 +92,7 @@ class StoredMap(Stored):
     """A map of 180 pixels in blocks of two rows."""
 
     name, total, block = "map", 180, 40
+    method = pb.methods.CorrectedLaplace(draws=64, sampler=None)
 
     @property
     def capture(self) -> Path:
@@ -104,8 +105,7 @@ class StoredMap(Stored):
 
     @override
     def run(self, store: Path, **asked: Any) -> xr.Dataset:
-        method = pb.methods.CorrectedLaplace(draws=64, sampler=None)
-        given = {"method": method, **plate_images.ASKED, **asked}
+        given = {"method": self.method, **plate_images.ASKED, **asked}
         return pb.maps.map_file(given.pop("capture", self.capture), store, **given).load()
 
     @override

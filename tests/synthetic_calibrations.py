@@ -75,6 +75,14 @@ def make_calibration(
     return tree
 
 
+def assert_held_as_stated(table, count):
+    """Intervals hold the truth as often as they say, within 3.3 standard errors."""
+    for percent in (50, 80, 95):
+        share = percent / 100.0
+        error = np.sqrt(share * (1.0 - share) / count)
+        assert np.abs(table[f"held_{percent}"] - share).max() < 3.3 * error
+
+
 def _readings(spread, count, failed, random):
     found: dict = {"predictive_pit": {}, "loo_pit": {}, "readings": {}}
     for name in ("dop", "intensity"):

@@ -13,7 +13,7 @@ from polar_bayes.inference.problem import Problem, make_problem
 from polar_bayes.inference.request import Request, resolve
 
 NOISE = 0.5
-VIEWS = np.linspace(35.0, 75.0, 6)
+VIEWS, BEND = np.linspace(35.0, 75.0, 6), 0.02
 
 
 def capture(seed: int = 0) -> xr.Dataset:
@@ -50,6 +50,12 @@ def of_line(readings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return covariance @ design.T @ readings / NOISE**2, covariance
 
 
+def least_squares(readings: np.ndarray) -> list[float]:
+    """Level and slope of the line of least squares."""
+    slope, level = np.polyfit(np.linspace(-1.0, 1.0, len(readings)), readings, 1)
+    return [level, slope]
+
+
 def squared(data, scene, priors, links) -> None:
     """Readings of a square: the root may have either sign, and half of the posterior has each."""
     del scene, priors, links
@@ -77,9 +83,6 @@ def deep_funnel(data, scene, priors, links) -> None:
         numpyro.sample(f"inside_{number}", dist.Normal(0.0, jnp.exp(0.5 * width)))
     with numpyro.plate("view", data.shape[-1]):
         numpyro.sample("q", dist.Normal(0.0, NOISE), obs=data.readings["q"])
-
-
-BEND = 0.02
 
 
 def bent(data, scene, priors, links) -> None:

@@ -25,9 +25,6 @@ LINKS = {"q": pb.links.StokesLink()}
 ROUGHLY = pb.benchmark.Reference(error=0.05, longer=0)
 
 
-pytestmark = pytest.mark.usefixtures("compiled_in_haste")
-
-
 @dataclasses.dataclass(frozen=True)
 class Biased(AbstractMethod):
     """Draws of the exact posterior of the line, moved by so many standard deviations."""
@@ -53,14 +50,16 @@ class Broken(AbstractMethod):
         raise pb.FitError("it cannot be", where="Broken", hint="nothing")
 
 
+@pytest.fixture(scope="module")
+def partial() -> list[xr.DataTree]:
+    return []
+
+
 @dataclasses.dataclass(frozen=True)
 class Stuck(AbstractOverride):
     """An override that cannot be changed."""
 
-    @property
-    @override
-    def name(self) -> str:
-        return "stuck"
+    name = "stuck"
 
     @override
     def apply(self, request, method):
@@ -68,26 +67,17 @@ class Stuck(AbstractOverride):
 
 
 @pytest.fixture(scope="module")
-def partial() -> list[xr.DataTree]:
-    return []
-
-
-@pytest.fixture(scope="module")
 def study(partial) -> xr.DataTree:
+    overrides = (
+        pb.benchmark.DrawsOverride(0.1),
+        pb.benchmark.FacetsOverride(2.0),
+        pb.benchmark.PrecisionOverride(),
+        Stuck(),
+    )
+    methods = {"biased": Biased(), "right": Biased(shift=0.0), "broken": Broken()}
+    asked = {"model": line, "links": LINKS, "reference": ROUGHLY, "fresh": False}
     return pb.accuracy(
-        capture(),
-        model=line,
-        links=LINKS,
-        methods={"biased": Biased(), "right": Biased(shift=0.0), "broken": Broken()},
-        overrides=(
-            pb.benchmark.DrawsOverride(0.1),
-            pb.benchmark.FacetsOverride(2.0),
-            pb.benchmark.PrecisionOverride(),
-            Stuck(),
-        ),
-        reference=ROUGHLY,
-        fresh=False,
-        partial=partial.append,
+        capture(), methods=methods, overrides=overrides, partial=partial.append, **asked
     )
 
 
@@ -100,7 +90,7 @@ def test_what_is_known_so_far_is_told_after_each_row(study, partial):
         assert pb.benchmark.accuracy_sentences(tree)
 
 
-def test_errors_are_in_sds_of_the_reference(study):
+def test_errors_are_in_sds_of_the_reference_which_states_its_own(study):
     found = study["accuracy"].to_dataset()
     mean, covariance = of_line(capture()["q"].to_numpy())
     sd = np.sqrt(np.diagonal(covariance))
@@ -112,11 +102,7 @@ def test_errors_are_in_sds_of_the_reference(study):
     np.testing.assert_allclose(errors[0], 0.5, atol=0.3)
     np.testing.assert_allclose(errors[1], 0.0, atol=0.3)
     np.testing.assert_allclose(errors[0] - errors[1], 0.5, atol=0.1)
-
-
-@pytest.mark.thorough
-def test_the_reference_states_its_own_error(study):
-    told = study["accuracy"].attrs
+    told = found.attrs
     assert told["reference"] == "NUTS"
     assert 0.0 < told["reference_error"] < 0.05
     assert told["reference_r_hat"] < 1.01
@@ -124,19 +110,14 @@ def test_the_reference_states_its_own_error(study):
     assert told["reference_ess"] > 400
 
 
-def test_a_method_that_fails_is_a_row_that_says_why(study):
+def test_a_method_or_an_override_that_fails_is_a_row_that_says_why(study):
     table = pb.summary(study)
-    assert "it cannot be" in table.loc["broken", "problems"]
-    assert np.isnan(table.loc["broken", "error"])
+    rows = {"broken": "it cannot be"}
+    rows |= {f"{method}, stuck": "it is rusty" for method in ("biased", "right", "broken")}
+    for row, said in rows.items():
+        assert said in table.loc[row, "problems"]
+        assert np.isnan(table.loc[row, "error"])
     assert not table.loc["broken", "on_front"]
-
-
-@pytest.mark.thorough
-def test_an_override_that_fails_is_a_row_that_says_why(study):
-    table = pb.summary(study)
-    for method in ("biased", "right", "broken"):
-        assert "it is rusty" in table.loc[f"{method}, stuck", "problems"]
-        assert np.isnan(table.loc[f"{method}, stuck", "error"])
 
 
 @pytest.mark.thorough
@@ -156,24 +137,17 @@ def test_a_choice_of_effects_that_failed_is_not_tried_again(monkeypatch):
 
 
 def test_dials_turn_what_they_can_and_leave_the_rest_out(study):
-    found = study["accuracy"].to_dataset()
+    found, table = study["accuracy"].to_dataset(), pb.summary(study)
     pairs = list(zip(found["method"].to_numpy(), found["override"].to_numpy(), strict=True))
     assert pairs[:3] == [("biased", AS_GIVEN), ("right", AS_GIVEN), ("broken", AS_GIVEN)]
     assert ("biased", "draws / 10") in pairs
     assert ("broken", "draws / 10") not in pairs  # it has no draws
     assert ("right", "single precision") in pairs
-    table = pb.summary(study)
     assert table.loc["right, draws / 10", "ess"] == 400
-
-
-@pytest.mark.thorough
-def test_without_processes_of_their_own_first_times_and_memory_are_not_told(study):
-    table = pb.summary(study)
-    assert table["seconds_first"].isna().all()
-    assert table["peak_memory"].isna().all()
+    # Without processes of their own, first times and memory are not told.
+    assert table[["seconds_first", "peak_memory"]].isna().all(axis=None)
     assert (table.loc[["biased", "right"], "seconds_again"] > 0.0).all()
-    about = json.loads(study.attrs["polar_bayes"])
-    assert about["fresh_processes"] is False
+    assert json.loads(study.attrs["polar_bayes"])["fresh_processes"] is False
 
 
 @pytest.mark.thorough
@@ -208,8 +182,8 @@ def test_an_override_of_draws_turns_what_its_name_says_or_nothing():
 @pytest.mark.thorough
 def test_every_override_has_a_name_of_its_own():
     every: list[AbstractOverride] = [
-        pb.benchmark.DrawsOverride(0.25), pb.benchmark.DrawsOverride(4.0),
-        pb.benchmark.FacetsOverride(0.5), pb.benchmark.FacetsOverride(2.0),
+        *(pb.benchmark.DrawsOverride(factor) for factor in (0.25, 4.0)),
+        *(pb.benchmark.FacetsOverride(factor) for factor in (0.5, 2.0)),
         pb.benchmark.EffectsOverride(), pb.benchmark.PrecisionOverride(),
     ]  # fmt: skip
     names = [override.name for override in every]

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any, override
 
 import jax
@@ -10,7 +11,8 @@ import numpyro
 import pytest
 import xarray as xr
 from numpyro import distributions as dist
-from plates import GONIOMETER, GONIOMETER_VIEWS, LINKS, PLATE, plate_capture, plates
+from plates import GONIOMETER, GONIOMETER_VIEWS, LINKS, ON_PLATE, PLATE, plate_capture, plates
+from synthetic_calibrations import assert_held_as_stated
 from toy_models import line
 
 import polar_bayes as pb
@@ -22,7 +24,6 @@ from polar_bayes.inference.program import BLOCK
 from polar_bayes.inference.request import resolve
 from polar_bayes.methods.method import AbstractMethod, PosteriorDraws, thin_draws
 from polar_bayes.observation.data import observe
-from polar_bayes.progress import no_progress
 
 COUNT, PATCHES, VIEWS, NOISE = 80, 3, 4, 0.5
 SHORT = pb.methods.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
@@ -43,7 +44,8 @@ def population_of(noise: float) -> Callable:
 
 
 population, too_sure = population_of(NOISE), population_of(NOISE / 2.0)
-ASKED: dict[str, Any] = {"scene": PLATE, "links": LINKS, "readings": False}
+ASKED: dict[str, Any] = ON_PLATE | {"readings": False}
+OF_PATCHES = ASKED | {"model": population, "method": pb.methods.Laplace(draws=200, chains=1)}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -61,8 +63,7 @@ def capture() -> xr.Dataset:
 
 @pytest.fixture(scope="module")
 def exact(capture: xr.Dataset) -> xr.DataTree:
-    laplace = pb.methods.Laplace(draws=200, chains=1)
-    return pb.calibrate(capture, simulations=COUNT, model=population, method=laplace, **ASKED)
+    return pb.calibrate(capture, simulations=COUNT, **OF_PATCHES)
 
 
 @pytest.mark.thorough
@@ -73,10 +74,7 @@ def test_an_exact_method_passes_patch_by_patch(exact: xr.DataTree) -> None:
     p_values = table.filter(like="p_")
     assert p_values.min(axis=None) > 1e-3 / p_values.size
     assert (table["answered"] == COUNT).all()
-    for percent in (50, 80, 95):
-        share = percent / 100.0
-        error = np.sqrt(share * (1.0 - share) / COUNT)
-        assert np.abs(table[f"held_{percent}"] - share).max() < 3.3 * error
+    assert_held_as_stated(table, COUNT)
     assert exact["truth"]["level"].dims == ("simulation", "patch")
     assert (exact["fits"]["status"] == Status.GOOD).all()
     assert (exact["fits"]["method"] == MethodUsed.LAPLACE).all()
@@ -84,8 +82,7 @@ def test_an_exact_method_passes_patch_by_patch(exact: xr.DataTree) -> None:
 
 @pytest.mark.thorough
 def test_a_model_that_is_too_sure_is_caught(capture: xr.Dataset) -> None:
-    laplace, told = pb.methods.Laplace(draws=200, chains=1), {"model": population}
-    asked = {"model": too_sure, "method": laplace, "truth": told, **ASKED}
+    asked = OF_PATCHES | {"model": too_sure, "truth": {"model": population}}
     table = pb.summary(pb.calibrate(capture, simulations=40, **asked))
     assert not pb.calibration.is_calibrated(table)
     assert (table["rank_spread"].drop("location") > 1.0).all()
@@ -93,8 +90,7 @@ def test_a_model_that_is_too_sure_is_caught(capture: xr.Dataset) -> None:
 
 @pytest.mark.thorough
 def test_a_fit_does_not_depend_on_how_many_there_are(capture, exact):
-    laplace = pb.methods.Laplace(draws=200, chains=1)
-    few = pb.calibrate(capture, simulations=22, model=population, method=laplace, **ASKED)
+    few = pb.calibrate(capture, simulations=22, **OF_PATCHES)
     for group in ("truth", "prior_sbc", "marginals"):
         some = exact[group].to_dataset().isel(simulation=slice(22))
         xr.testing.assert_identical(few[group].to_dataset(), some)
@@ -119,22 +115,19 @@ def test_fits_without_draws_are_counted(capture, monkeypatch):
     inner = problem.CompiledModel.initializer.func
     refused = []
 
-    class Refusing:
-        def __init__(self, initializer) -> None:
-            self._grounds = initializer
-            self.is_joint = initializer.is_joint
+    def refusing(model):
+        initializer = inner(model)
 
-        def find(self, data, *further):
+        def find(data, *further):
             if float(data.readings["q"].mean()) > 0.0:
                 refused.append(None)
                 raise FitError("no start reached a peak", where="fit", hint="look at it")
-            return self._grounds.find(data, *further)
+            return initializer.find(data, *further)
 
-    monkeypatch.setattr(
-        problem.CompiledModel, "initializer", property(lambda self: Refusing(inner(self)))
-    )
-    laplace = pb.methods.Laplace(draws=50, chains=1)
-    found = pb.calibrate(capture, simulations=24, model=population, method=laplace, **ASKED)
+        return SimpleNamespace(find=find, is_joint=initializer.is_joint)
+
+    monkeypatch.setattr(problem.CompiledModel, "initializer", property(refusing))
+    found = pb.calibrate(capture, simulations=24, **OF_PATCHES)
     lost = found["fits"]["status"].to_numpy() == Status.NOT_CONVERGED
     assert 0 < lost.sum() == len(refused) < 24
     assert np.array_equal(np.isnan(found["prior_sbc"]["location"].to_numpy()), lost)
@@ -151,35 +144,15 @@ def test_weighted_draws_of_a_discrepancy_are_made_one_after_another_in_double_pr
     assert np.mean(found["fits"]["status"] == Status.GOOD) > 0.5
 
 
-def problem_of(capture: xr.Dataset) -> Problem:
-    request = resolve(capture, population, PLATE, None, LINKS, None, 0, "double")
-    data = observe(request.capture)
-    return Problem(compile_model(request, data), data, jax.random.key(1))
-
-
-@pytest.mark.thorough
-def test_a_fit_is_that_of_the_public_verb(capture: xr.Dataset) -> None:
-    """The same posterior: mean and spread against the closed form."""
-    settings, here = pb.methods.Laplace(draws=4000, chains=1), problem_of(capture)
-    parameters = here.constrain(settings.run(here, jax.random.key(2), no_progress).z)
-    q = np.asarray(here.data.readings["q"])
-    # Patch means are normal around the location with the variance of a patch and of its mean.
-    spread = 1.0 + NOISE**2 / VIEWS
-    precision = 0.25 + PATCHES / spread
-    mean, sd = q.mean(axis=1).sum() / spread / precision, precision**-0.5
-    draws = parameters["location"]
-    assert abs(draws.mean() - mean) < 4.0 * sd / np.sqrt(draws.size)
-    assert draws.std() == pytest.approx(sd, rel=4.0 / np.sqrt(2.0 * draws.size))
-
-
 @pytest.mark.thorough
 def test_chains_of_any_length_have_their_parameters(capture: xr.Dataset) -> None:
-    here = problem_of(capture)
-    program = here.program
-    z = np.random.default_rng(1).normal(size=(2, BLOCK + 3, program.size))
+    request = resolve(capture, population, PLATE, None, LINKS, None, 0, "double")
+    data = observe(request.capture)
+    here = Problem(compile_model(request, data), data, jax.random.key(1))
+    z = np.random.default_rng(1).normal(size=(2, BLOCK + 3, here.program.size))
     found = here.constrain(z)
     assert found["level"].shape[:2] == z.shape[:2]
-    last = program.parameters(z[1, -1], here.data)["level"]
+    last = here.program.parameters(z[1, -1], here.data)["level"]
     np.testing.assert_array_equal(found["level"][1, -1], last)
 
 

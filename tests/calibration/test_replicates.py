@@ -1,6 +1,7 @@
 """Repeats and proxies: posteriors of a known property, and the rate of false alarms."""
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from scipy import stats
@@ -39,48 +40,45 @@ def test_repeats_that_scatter_as_they_say_raise_few_alarms() -> None:
     assert np.mean(pairs) == pytest.approx(0.95, abs=0.02)
 
 
+EVEN = stats.norm.ppf((np.arange(12) + 0.5) / 12)
+
+
 def test_repeats_that_scatter_more_are_told_by_how_much() -> None:
-    means = 1.5 + 3.0 * SD * stats.norm.ppf((np.arange(12) + 0.5) / 12)
-    row = pb.calibration.retest(fits({"refractive_index": means})).loc["refractive_index"]
+    means = 1.5 + 3.0 * SD * EVEN
+    row = retested(means)
     assert row["scatter"] == pytest.approx(means.std(ddof=1), rel=1e-9)
     assert row["expected"] == pytest.approx(SD, rel=0.01)
     assert row["chi_square"] == pytest.approx(np.sum((means - means.mean()) ** 2) / SD**2, rel=0.02)
     assert row["p_value"] < 1e-4
     assert row["agreeing"] < 0.6
     assert row["pairs"] == 66
-    assert (
-        row["conclusion"]
-        == f"repeats scatter {row['ratio']:.1f} times more than the intervals predict"
-    )
+    said = f"repeats scatter {row['ratio']:.1f} times more than the intervals predict"
+    assert row["conclusion"] == said
 
 
 @pytest.mark.thorough
-def test_repeats_that_scatter_less_are_no_alarm() -> None:
-    means = 1.5 + 0.1 * SD * stats.norm.ppf((np.arange(12) + 0.5) / 12)
-    words = pb.calibration.retest(fits({"refractive_index": means})).loc[
-        "refractive_index", "conclusion"
-    ]
+def test_repeats_that_scatter_less_are_no_alarm_and_failed_ones_are_counted() -> None:
+    words = retested(1.5 + 0.1 * SD * EVEN)["conclusion"]
     assert "the rest of the intervals is what all repeats share" in words
-
-
-@pytest.mark.thorough
-def test_failed_repeats_are_counted() -> None:
-    row = pb.calibration.retest(fits({"roughness": np.array([0.3, np.nan, 0.31, 0.29])})).iloc[0]
+    row = retested([0.3, np.nan, 0.31, 0.29])
     assert (row["repeats"], row["failed"], row["pairs"]) == (3, 1, 3)
-    alone = pb.calibration.retest(fits({"roughness": np.array([0.3, np.nan])})).iloc[0]
-    assert alone["conclusion"] == "too few repeats have an answer"
+    assert retested([0.3, np.nan])["conclusion"] == "too few repeats have an answer"
+
+
+def retested(means) -> pd.Series:
+    """What repeats of one parameter say of each other."""
+    return pb.calibration.retest(fits({"roughness": np.asarray(means)})).loc["roughness"]
 
 
 def test_what_are_no_repeats_is_refused() -> None:
-    with pytest.raises(
-        pb.FitError, match="a single fit has nothing to agree with; give two or more"
-    ):
-        pb.calibration.retest(fits({"roughness": np.array([0.3])}))
     strangers = [*fits({"roughness": np.zeros(1)}), *fits({"absorption": np.zeros(1)})]
-    with pytest.raises(pb.FitError, match="share no parameter"):
-        pb.calibration.retest(strangers)
-    with pytest.raises(pb.FitError, match="it holds no fit"):
-        pb.calibration.retest([xr.DataTree(), xr.DataTree()])
+    for repeats, said in (
+        (strangers[:1], "a single fit has nothing to agree with; give two or more"),
+        (strangers, "share no parameter"),
+        ([xr.DataTree(), xr.DataTree()], "it holds no fit"),
+    ):
+        with pytest.raises(pb.FitError, match=said):
+            pb.calibration.retest(repeats)
 
 
 def test_intervals_hold_proxies_as_often_as_they_say() -> None:

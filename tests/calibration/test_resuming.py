@@ -12,7 +12,6 @@ import numpy as np
 import numpyro.distributions as dist
 import pytest
 import xarray as xr
-from cases import each
 from plate_images import ASKED, LINKS
 from plates import PLATE, plate_capture
 from stores import StoredCalibration, assert_same_bits, copied, stored
@@ -56,18 +55,14 @@ def test_more_or_fewer_simulations_are_the_same_question(kind, whole, begun, tmp
     assert sum(fits) == kind.total
 
 
-@each(
-    ("other", "topic"),
-    [
+def test_another_question_is_refused(kind, begun) -> None:
+    for other, topic in (
         ({"truth": {"priors": {"refractive_index": dist.Uniform(1.2, 2.0)}}}, "truth"),
         ({"readings": False}, "readings"),
         ({"capture": plate_capture(VIEWS + 1e-9, 0.03, seed=0)}, "capture"),
-    ],
-    ids=lambda each: each if isinstance(each, str) else "",
-)
-def test_another_question_is_refused(kind, begun, other, topic) -> None:
-    with pytest.raises(pb.FitError, match=f"begun with another {topic}; repeat the command as"):
-        kind.run(begun, resume=True, **other)
+    ):
+        with pytest.raises(pb.FitError, match=f"begun with another {topic}; repeat the command as"):
+            kind.run(begun, resume=True, **other)
 
 
 def test_what_cannot_be_gone_on_with_is_refused(kind, begun, tmp_path) -> None:

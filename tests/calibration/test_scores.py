@@ -12,20 +12,20 @@ def even(fits: int, draws: int) -> np.ndarray:
     return np.full((fits, draws), 1.0 / draws)
 
 
-def test_the_truth_among_draws_of_its_own_distribution_is_uniform() -> None:
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda random: random.normal(size=(4000, 20)),
+        lambda random: random.normal(size=(4000, 3)),
+        # Ties are shared evenly.
+        lambda random: random.integers(0, 3, size=(4000, 20)).astype(float),
+    ],
+)
+def test_the_truth_among_draws_of_its_own_distribution_is_uniform(make) -> None:
     random = np.random.default_rng(0)
-    values = random.normal(size=(4000, 20))
-    pit = randomized_pit(values[:, 1:], even(4000, 19), values[:, 0], random.random(4000))
-    assert stats.kstest(pit, "uniform").pvalue > 1e-3
-    few = randomized_pit(values[:, 1:3], even(4000, 2), values[:, 0], random.random(4000))
-    assert stats.kstest(few, "uniform").pvalue > 1e-3
-
-
-@pytest.mark.thorough
-def test_ties_are_shared_evenly() -> None:
-    random = np.random.default_rng(1)
-    values = random.integers(0, 3, size=(4000, 20)).astype(float)
-    pit = randomized_pit(values[:, 1:], even(4000, 19), values[:, 0], random.random(4000))
+    values = make(random)
+    weights = even(4000, values.shape[1] - 1)
+    pit = randomized_pit(values[:, 1:], weights, values[:, 0], random.random(4000))
     assert stats.kstest(pit, "uniform").pvalue > 1e-3
 
 

@@ -1,13 +1,13 @@
 """One name, one algorithm: every verb runs the settings that a fit runs, or refuses the name."""
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 from plate_images import plate_image
-from plates import LINKS, PLATE, plate_capture
+from plates import ON_PLATE, plate_capture
 from toy_models import line
 
 import polar_bayes as pb
@@ -15,7 +15,7 @@ from polar_bayes.cli.entry import main
 from polar_bayes.methods.method import AbstractMethod, find_method, make_method
 from polar_bayes.methods.registry import METHODS, method_names
 
-ASKED = {"model": line, "scene": PLATE, "links": LINKS}
+ASKED = ON_PLATE | {"model": line}
 """A model that compiles in a moment: what is asked for counts here, and no answer."""
 
 
@@ -23,46 +23,24 @@ class Ran(BaseException):
     """Records what a verb was about to run; a base exception that no handler catches."""
 
 
-def capture() -> Any:
-    return plate_capture(np.linspace(30.0, 75.0, 6), 0.02, seed=1)
-
-
-def fit(name: str) -> None:
-    pb.fit(capture(), method=name, **ASKED)
-
-
-def fit_pixels(name: str) -> None:
-    pb.fit_pixels(plate_image(1, 2), method=name, **ASKED)
-
-
-def calibrate(name: str) -> None:
-    pb.calibrate(capture(), method=name, simulations=20, **ASKED)
-
-
-VERBS: dict[str, tuple[Callable[[str], None], str]] = {
-    "fit": (fit, "run"),
-    "fit_pixels": (fit_pixels, "run_batch"),
-    "calibrate": (calibrate, "run_batch"),
+CAPTURE, IMAGE = plate_capture(np.linspace(30.0, 75.0, 6), 0.02, seed=1), plate_image(1, 2)
+CALIBRATED = ASKED | {"simulations": 20}
+VERBS: dict[str, tuple[Callable[[str], object], str]] = {
+    "fit": (lambda name: pb.fit(CAPTURE, method=name, **ASKED), "run"),
+    "fit_pixels": (lambda name: pb.fit_pixels(IMAGE, method=name, **ASKED), "run_batch"),
+    "calibrate": (lambda name: pb.calibrate(CAPTURE, method=name, **CALIBRATED), "run_batch"),
 }
 """Each verb, and the function of a method that it calls."""
 
 
-@pytest.fixture
-def stopped(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, str], None]]:
-    """Methods end with their own settings instead of running."""
-
-    def run(self: Any, *given: object, **further: object) -> None:
-        raise Ran(self)
-
-    def stop(name: str, function: str) -> None:
-        monkeypatch.setattr(type(make_method(name)), function, run)
-
-    return stop
+def run(self: Any, *given: object, **further: object) -> None:
+    raise Ran(self)
 
 
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("verb", VERBS)
-def test_a_verb_runs_what_a_fit_runs_or_refuses_the_name(verb, name, stopped):
+def test_a_verb_runs_what_a_fit_runs_or_refuses_the_name(verb, name, monkeypatch):
+    """Methods end with their own settings instead of running."""
     call, function = VERBS[verb]
     able = method_names(one=verb == "fit", many=verb != "fit")
     if name not in able:
@@ -70,7 +48,7 @@ def test_a_verb_runs_what_a_fit_runs_or_refuses_the_name(verb, name, stopped):
             call(name)
         assert "\n" not in str(refused.value)
         return
-    stopped(name, function)
+    monkeypatch.setattr(type(make_method(name)), function, run)
     with pytest.raises(Ran) as ran:
         call(name)
     (found,) = ran.value.args
@@ -90,7 +68,7 @@ def test_a_command_hands_the_name_on(command, name, monkeypatch, tmp_path):
 
     for owner, function in ((pb, "fit"), (pb, "calibrate"), (pb.maps, "map_file")):
         monkeypatch.setattr(owner, function, note)
-    pb.save_capture(capture(), tmp_path / "capture.nc")
+    pb.save_capture(CAPTURE, tmp_path / "capture.nc")
     asked = [command, str(tmp_path / "capture.nc"), "--method", name]
     assert main([*asked, "--out", str(tmp_path / "out.nc")]) == 1
     able = method_names(one=command == "fit", many=command != "fit")

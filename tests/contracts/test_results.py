@@ -83,11 +83,13 @@ def test_every_result_has_a_page_that_stands_alone(name, make, tmp_path: Path) -
 
 
 def test_one_kind_of_result_is_not_taken_for_another(tmp_path: Path) -> None:
-    pb.save(make_calibration(), tmp_path / "calibration.nc")
-    pb.save(make_result(**SMALL), tmp_path / "fit.nc")
-    for kind, name in (("fit", "calibration"), ("accuracy", "calibration"), ("calibration", "fit")):
-        with pytest.raises(pb.FitError, match=rf"{name}.nc: it holds no {kind}; give the file"):
-            pb.load(tmp_path / f"{name}.nc", kind)
+    results = {name: RESULTS[name]() for name in ("fit", "calibration", "accuracy")}
+    results["other"] = results["accuracy"]["accuracy"].to_dataset()
+    for name, result in results.items():
+        pb.save(result, tmp_path / f"{name}.nc")
+        for kind in {"fit", "calibration", "accuracy"} - {name}:
+            with pytest.raises(pb.FitError, match=rf"{name}.nc: it holds no {kind}; give the file"):
+                pb.load(tmp_path / f"{name}.nc", kind)
     (tmp_path / "text.nc").write_text("nothing")
     with pytest.raises(pb.FitError, match="cannot be read as netCDF; give the file that polar_bay"):
         pb.load(tmp_path / "text.nc", "calibration")

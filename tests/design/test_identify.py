@@ -4,27 +4,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from numpyro import handlers
-from plates import LINKS, PLATE, at_mirror, plate_capture
+from plates import KNOWN, at_mirror, plate_capture
 from scipy.special import polygamma
 from textbook import plate_q
 
 import polar_bayes as pb
 from polar_bayes.design.fisher import positive_definite
-from polar_bayes.models.per_material import per_material
 
-ASKED = {
-    "model": handlers.condition(per_material, data={"stokes_error_factor": 1.0}),
-    "scene": PLATE,
-    "links": LINKS,
-}
 VIEWS = np.array([30.0, 42.0, 55.0, 68.0, 74.0, 80.0])
 pytestmark = pytest.mark.usefixtures("without_comparisons")
 
 
 @pytest.fixture(scope="module")
 def plate() -> xr.Dataset:
-    return pb.identify(plate_capture(VIEWS, 0.01, seed=0), **ASKED)
+    return pb.identify(plate_capture(VIEWS, 0.01, seed=0), **KNOWN)
 
 
 def test_sensitivities_are_those_of_textbook_optics(plate: xr.Dataset) -> None:
@@ -41,7 +34,7 @@ def test_sensitivities_are_those_of_textbook_optics(plate: xr.Dataset) -> None:
 
 def test_expected_sds_are_those_of_a_fit(plate: xr.Dataset) -> None:
     """The readings of this capture are near what they are expected to be."""
-    result = pb.fit(plate_capture(VIEWS, 0.01, seed=0), method="laplace", **ASKED)
+    result = pb.fit(plate_capture(VIEWS, 0.01, seed=0), method="laplace", **KNOWN)
     sd = result["posterior"].to_dataset().std(("chain", "draw"))
     assert float(plate["expected_sd"].sel(parameter="refractive_index")) == pytest.approx(
         float(sd["refractive_index"]), rel=0.1
@@ -60,7 +53,7 @@ def test_what_is_told_has_small_shares_of_the_prior(plate: xr.Dataset) -> None:
 
 
 def test_without_information_the_prior_is_all_there_is() -> None:
-    found = pb.identify(plate_capture(VIEWS, 50.0, seed=0), **ASKED)
+    found = pb.identify(plate_capture(VIEWS, 50.0, seed=0), **KNOWN)
     assert found["prior_share"].to_numpy() == pytest.approx(1.0, abs=0.01)
     said = pb.verdict(found).sentences
     assert any(line.startswith("refractive_index is not determined: ") for line in said)
@@ -102,7 +95,7 @@ def of_glass(glass: xr.Dataset) -> xr.Dataset:
 def test_glass_does_not_tell_its_absorption(glass: xr.Dataset, of_glass: xr.Dataset) -> None:
     said = pb.verdict(of_glass).sentences
     assert any(line.startswith("absorption is not determined: ") for line in said)
-    asked = ASKED | {"scene": POLISHED, "points": 5}
+    asked = KNOWN | {"scene": POLISHED, "points": 5}
     flat = pb.verdict(pb.profile(glass, "absorption", **asked)).sentences
     assert flat[0].startswith("absorption is flat: the data exclude nothing below, down to 0.0")
 

@@ -9,13 +9,11 @@ import xarray as xr
 from cases import each
 from design_lines import ASKED, NOISE, PRIOR, angles, line, line_capture, precision_of, rows_of
 from numpyro import distributions as dist
-from numpyro import handlers
-from plates import LINKS, PLATE, plate_capture
+from plates import KNOWN, ON_PLATE, plate_capture
 from synthetic_results import make_result
 
 import polar_bayes as pb
 from polar_bayes.design.optimal_design import fedorov_exchange
-from polar_bayes.models.per_material import per_material
 
 START = np.array([40.0, 50.0])
 GRID = np.linspace(10.0, 80.0, 8)
@@ -64,16 +62,13 @@ def test_exchange_mends_what_greed_got_wrong() -> None:
     """The best single view is in no best pair: greed takes it, exchange gives it back."""
     base = 1e-3 * np.eye(2)
     rows = np.array([[0.8, 0.8], [1.0, 0.0], [0.0, 1.0]])
-    each = rows[:, :, None] * rows[:, None, :]
+    each, apart = rows[:, :, None] * rows[:, None, :], np.eye(3, dtype=bool)
 
     def loss(information: np.ndarray) -> np.ndarray:
         return np.trace(np.linalg.inv(information), axis1=-2, axis2=-1)[0]
 
-    greedy_first = int(np.argmin(loss((base + each)[None])))
-    chosen = fedorov_exchange(
-        loss, base[None], each[None], np.ones(3, bool), np.eye(3, dtype=bool), 2
-    )
-    assert greedy_first == 0
+    assert int(np.argmin(loss((base + each)[None]))) == 0
+    chosen = fedorov_exchange(loss, base[None], each[None], np.ones(3, bool), apart, 2)
     assert set(chosen.picks) == {1, 2}
     assert chosen.exchanges > 0
 
@@ -100,8 +95,7 @@ def test_a_fit_tells_its_capture_scene_and_priors() -> None:
     """A goniometer's capture holds the degree of polarization, too, which is not fitted."""
     plate = plate_capture(np.linspace(20.0, 60.0, 6), 0.01, seed=2)
     plate = plate.assign(dop=abs(plate["q"]), dop_error=plate["q_error"])
-    asked = {"scene": PLATE, "links": LINKS}
-    asked["priors"] = {"refractive_index": dist.Uniform(1.3, 1.8)}
+    asked = ON_PLATE | {"priors": {"refractive_index": dist.Uniform(1.3, 1.8)}}
     fit = pb.fit(plate, method=pb.methods.Laplace(draws=50), **asked)
     told, found = pb.next_views(fit, count=1), pb.next_views(plate, count=1, result=fit, **asked)
     xr.testing.assert_identical(told.drop_attrs(), found.drop_attrs())
@@ -135,18 +129,18 @@ def test_new_views_are_as_bright_as_predicted_and_old_ones_as_recorded() -> None
 @pytest.mark.thorough
 def test_a_fit_may_say_what_the_parameters_may_be() -> None:
     """A line tells the same of its parameters wherever they are, so only the draws differ."""
+
+    def fitted(drawn: np.ndarray) -> xr.DataTree:
+        draws = xr.DataArray(drawn, dims=("parameter", "chain", "draw"))
+        posterior = xr.Dataset({"level": draws[0], "slope": draws[1]})
+        return xr.DataTree.from_dict({"posterior": posterior})
+
     drawn = np.random.default_rng(0).normal(0.0, 0.1, (2, 1, 30))
     drawn[0, 0, 3] = np.nan
-    group = {
-        name: (("chain", "draw"), x) for name, x in zip(("level", "slope"), drawn, strict=True)
-    }
-    result = xr.DataTree.from_dict({"posterior": xr.Dataset(group)})
-    np.testing.assert_allclose(
-        on_a_line(count=1, result=result)["expected_sd"], on_a_line(count=1)["expected_sd"]
-    )
-    group = {name: (("chain", "draw"), x * np.nan) for name, (_, x) in group.items()}
+    found = on_a_line(count=1, result=fitted(drawn))
+    np.testing.assert_allclose(found["expected_sd"], on_a_line(count=1)["expected_sd"])
     with pytest.raises(pb.FitError, match="none of its draws is finite"):
-        on_a_line(result=xr.DataTree.from_dict({"posterior": xr.Dataset(group)}))
+        on_a_line(result=fitted(drawn * np.nan))
 
 
 @pytest.mark.thorough
@@ -197,12 +191,6 @@ def test_constraints_are_checked() -> None:
 
 # --- a plate: physics, other readings, the draws of a fit -----------------------------------------
 
-PLATE_ASKED = {
-    "model": handlers.condition(per_material, data={"stokes_error_factor": 1.0}),
-    "scene": PLATE,
-    "links": LINKS,
-}
-
 
 @pytest.fixture(scope="module")
 def plate() -> xr.Dataset:
@@ -212,10 +200,10 @@ def plate() -> xr.Dataset:
 @pytest.mark.thorough
 def test_what_is_expected_is_what_a_larger_capture_gives(plate: xr.Dataset) -> None:
     """The expected sds after the views agree with `identify` where these views were measured."""
-    found = pb.next_views(plate, draws=1, count=2, **PLATE_ASKED)
+    found = pb.next_views(plate, draws=1, count=2, **KNOWN)
     zeniths = np.append(plate["view_zenith"], found["view_zenith"])
     assert np.all(found["view_zenith"] == found["light_zenith"])  # a goniometer's mirror
-    known = pb.identify(plate_capture(zeniths, 0.02, seed=3), **PLATE_ASKED)
+    known = pb.identify(plate_capture(zeniths, 0.02, seed=3), **KNOWN)
     for name in ("refractive_index", "subsurface_fraction"):
         expected = float(known["expected_sd"].sel(parameter=name))
         assert float(found["expected_sd"].sel(parameter=name)[-1]) == pytest.approx(
@@ -236,7 +224,7 @@ def test_another_reading_can_be_added_even_at_the_ends(plate: xr.Dataset) -> Non
         count=3,
         draws=4,
         constraints=pb.design.Constraints(repeatable=True),
-        **PLATE_ASKED,
+        **KNOWN,
     )
     assert set(found["reading"].to_numpy()) == {"intensity"}
     assert np.isfinite(found["expected_sd"]).all()
@@ -249,11 +237,11 @@ def test_one_wavelength_at_a_time(plate: xr.Dataset) -> None:
     two = xr.concat([plate, plate], dim="wavelength", data_vars=["q", "q_error"])
     two = two.assign_coords(wavelength=[450.0, 650.0])
     only = angles([30.0, 60.0]).assign_coords(wavelength=[450.0])
-    found = pb.next_views(two, only, apart=("wavelength",), count=2, draws=2, **PLATE_ASKED)
+    found = pb.next_views(two, only, apart=("wavelength",), count=2, draws=2, **KNOWN)
     assert found["wavelength"].to_numpy().tolist() == [450.0, 450.0]
     width = found["interval_width"].isel(step=-1) / found["interval_width"].isel(step=0)
     assert width.sel(parameter="refractive_index[450]") < width.sel(
         parameter="refractive_index[650]"
     )
     with pytest.raises(pb.FitError, match="500 nm has parameters of its own"):
-        pb.next_views(two, only.assign_coords(wavelength=[500.0]), **PLATE_ASKED)
+        pb.next_views(two, only.assign_coords(wavelength=[500.0]), **KNOWN)

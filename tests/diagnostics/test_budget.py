@@ -1,5 +1,7 @@
 """The uncertainty budget: what the set-up adds is what other fits say, and it names what helps."""
 
+import re
+
 import numpy as np
 import numpyro
 import pandas as pd
@@ -58,6 +60,7 @@ def sds(fit: xr.DataTree) -> np.ndarray:
 RELATIVE = 0.07
 
 
+@pytest.mark.thorough  # `test_each_factor_of_a_normal_posterior...` has the closed form
 def test_a_perfect_set_up_would_have_the_intervals_that_a_fit_of_it_has(fit, perfect) -> None:
     np.testing.assert_allclose(pb.budget(fit)["perfect"], sds(perfect), rtol=RELATIVE)
     assert (sds(fit) > 1.05 * sds(perfect)).any()
@@ -185,19 +188,19 @@ def test_what_cannot_be_known_is_refused(fit, capture, known: dict, message: str
         "no input quantity of this scene": lambda: pb.fit(capture, known=known, **ASKED),
     }
     for what, door in doors.items():
-        with pytest.raises(pb.FitError) as caught:
+        with pytest.raises(pb.FitError, match=f"^{re.escape(message.format(what))}"):
             door()
-        assert str(caught.value).startswith(message.format(what))
     with pytest.raises(
         pb.FitError, match="capture: sample_lean_uncertainty: it is 'by eye'; give a"
     ):
         pb.fit(capture.assign_attrs(sample_lean_uncertainty="by eye"), **ASKED)
 
 
-def test_a_set_up_that_states_nothing_has_no_budget(capture, perfect) -> None:
-    assert budget_sentences(perfect) == ()
+def test_a_set_up_that_states_nothing_has_no_budget(capture) -> None:
+    nothing = make_result(wavelengths=(), views=12, draws=300, variables=("dop",))
+    assert budget_sentences(nothing) == ()
     with pytest.raises(pb.FitError, match="it has no input quantities of its set-up; fit with a"):
-        pb.budget(perfect)
+        pb.budget(nothing)
     with pytest.raises(pb.FitError, match="no input quantity of this scene; a scene's terms state"):
         pb.fit(capture, known={"sample_lean": 0.1}, **PERFECT)
 
@@ -205,13 +208,10 @@ def test_a_set_up_that_states_nothing_has_no_budget(capture, perfect) -> None:
 @pytest.mark.thorough
 def test_a_model_that_does_not_know_of_a_quantity_is_fitted_without(capture, perfect) -> None:
     def own(data, scene, priors, links):
-        given = {
-            name: numpyro.sample(name, priors[name])
-            for name in ("subsurface_fraction", "refractive_index")
-        }
+        names = ("subsurface_fraction", "refractive_index")
+        given = {name: numpyro.sample(name, priors[name]) for name in names}
         scale = numpyro.sample("stokes_error_factor", priors["stokes_error_factor"])
-        prediction = scene.predict(given, data.geometry)
-        noise = {"stokes_error_factor": scale}
+        prediction, noise = scene.predict(given, data.geometry), {"stokes_error_factor": scale}
         likelihood = links["q"].distribution("q", prediction, data, noise)
         with numpyro.plate("view", data.shape[-1]):
             numpyro.sample("q", likelihood, obs=data.readings["q"])

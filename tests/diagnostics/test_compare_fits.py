@@ -21,14 +21,17 @@ def off(result: xr.DataTree, by: float) -> xr.DataTree:
     return replace(result, "log_likelihood", "dop", density - by * (density["view"] % 3))
 
 
-def test_parameters_stand_side_by_side() -> None:
-    fits = {"a": make_result(**SMALL), "b": make_result(**SMALL, method="laplace")}
-    table = pb.diagnostics.compare_fits(fits).parameters
+def test_parameters_stand_side_by_side_and_a_point_fit_has_no_predictions() -> None:
+    methods = {"a": "nuts", "b": "laplace", "p": "point"}
+    fits = {name: make_result(**SMALL, method=method) for name, method in methods.items()}
+    compared = pb.diagnostics.compare_fits(fits)
     for name, fit in fits.items():
-        own = table.xs(name, level="fit")
+        own = compared.parameters.xs(name, level="fit")
         assert list(own.index) == list(summary(fit).index)
         np.testing.assert_array_equal(own["mean"], summary(fit)["mean"])
-    assert (table["verdict"] != "").all()
+    assert (compared.parameters["verdict"] != "").all()
+    assert list(compared.left_out) == ["p"]
+    assert set(compared.loo.index) == {"a", "b"}
 
 
 def test_predictions_are_those_of_the_reports_and_of_arviz() -> None:
@@ -51,25 +54,15 @@ def test_all_variables_count_together() -> None:
     assert loo.loc["a", "elpd"] == pytest.approx(sum(parts))
 
 
-def test_a_point_fit_has_parameters_and_no_predictions() -> None:
-    point = make_result(**SMALL, method="point")
-    fits = {"a": make_result(**SMALL), "b": make_result(**SMALL, method="laplace"), "p": point}
-    compared = pb.diagnostics.compare_fits(fits)
-    assert list(compared.left_out) == ["p"]
-    assert set(compared.loo.index) == {"a", "b"}
-    assert "p" in compared.parameters.index.get_level_values("fit")
-
-
 def test_another_capture_is_refused() -> None:
-    one, other = make_result(**SMALL), make_result(**SMALL, seed=1)
-    with pytest.raises(FitError, match="other: it is of another capture than one: dop differs"):
-        pb.diagnostics.compare_fits({"one": one, "other": other})
-    turned = make_result(**SMALL, azimuths=(90.0,))
-    with pytest.raises(FitError, match="view_azimuth differs"):
-        pb.diagnostics.compare_fits({"one": one, "other": turned})
-    fewer = make_result(**{**SMALL, "views": 15})
-    with pytest.raises(FitError, match="view_zenith differs"):
-        pb.diagnostics.compare_fits({"one": one, "other": fewer})
+    one = make_result(**SMALL)
+    for change, differs in (
+        ({"seed": 1}, "other: it is of another capture than one: dop differs"),
+        ({"azimuths": (90.0,)}, "view_azimuth differs"),
+        ({"views": 15}, "view_zenith differs"),
+    ):
+        with pytest.raises(FitError, match=differs):
+            pb.diagnostics.compare_fits({"one": one, "other": make_result(**SMALL | change)})
 
 
 @pytest.mark.thorough

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from cases import each
 from synthetic_maps import make_maps
 
 import polar_bayes as pb
@@ -26,6 +27,11 @@ def known(**truths: np.ndarray | float) -> xr.Dataset:
     )
 
 
+def coverage_of(maps: xr.Dataset, roughness: np.ndarray | float) -> pd.Series:
+    """The row of the roughness, whose truth is known."""
+    return pb.diagnostics.map_coverage(maps, known(roughness=roughness)).loc["roughness"]
+
+
 def wilson(share: float, count: int) -> tuple[float, float]:
     z = 1.959963984540054
     middle = (share + z**2 / (2 * count)) / (1 + z**2 / count)
@@ -35,20 +41,14 @@ def wilson(share: float, count: int) -> tuple[float, float]:
 
 
 def test_a_truth_that_is_spread_like_the_posterior_is_held_as_often_as_the_interval_says() -> None:
-    found = pb.diagnostics.map_coverage(make_maps({"roughness": HALF}), known(roughness=SPREAD))
-    row = found.loc["roughness"]
+    row = coverage_of(make_maps({"roughness": HALF}), SPREAD)
     assert row[["unknown", "masked", "unanswered", "answered"]].tolist() == [0, 0, 0, 2000]
     for claimed in (50, 80, 95):
         assert row[f"held_{claimed}"] == row[f"held_{claimed}_of_read"] == claimed / 100
         ends = row[f"held_{claimed}_low"], row[f"held_{claimed}_high"]
         np.testing.assert_allclose(ends, wilson(claimed / 100, 2000), rtol=1e-12)
-
-
-def test_intervals_half_as_wide_hold_half_as_many() -> None:
-    row = pb.diagnostics.map_coverage(
-        make_maps({"roughness": HALF}, width=0.5), known(roughness=SPREAD)
-    ).loc["roughness"]
-    assert [row[f"held_{each}"] for each in (50, 80, 95)] == [0.25, 0.4, 0.475]
+    half = coverage_of(make_maps({"roughness": HALF}, width=0.5), SPREAD)
+    assert [half[f"held_{each}"] for each in (50, 80, 95)] == [0.25, 0.4, 0.475]
 
 
 @pytest.mark.thorough
@@ -56,9 +56,7 @@ def test_ends_count_as_inside_in_the_precision_of_the_map() -> None:
     """0.3 in double precision lies below 0.3 in single precision."""
     maps = make_maps({"roughness": np.array([[0.3]])}, width=0.0)
     assert float(maps["roughness"][0, 0]) > 0.3
-    assert (
-        pb.diagnostics.map_coverage(maps, known(roughness=0.3)).loc["roughness", "held_50"] == 1.0
-    )
+    assert coverage_of(maps, 0.3)["held_50"] == 1.0
 
 
 def test_pixels_without_an_answer_are_counted_and_never_held() -> None:
@@ -66,8 +64,7 @@ def test_pixels_without_an_answer_are_counted_and_never_held() -> None:
     status = np.array([list(Status), [Status.GOOD] * count])
     true = np.full((2, count), 0.5)
     true[1, -2:] = 9.0, np.nan
-    maps = make_maps({"roughness": np.full((2, count), 0.5)}, status=status)
-    row = pb.diagnostics.map_coverage(maps, known(roughness=true)).loc["roughness"]
+    row = coverage_of(make_maps({"roughness": np.full((2, count), 0.5)}, status=status), true)
     # Good: one of the first row and all but one of the second, one of whose truths lies outside.
     counts = [1, 1, count - 2, count]
     assert row[["unknown", "masked", "unanswered", "answered"]].tolist() == counts
@@ -77,8 +74,8 @@ def test_pixels_without_an_answer_are_counted_and_never_held() -> None:
 
 @pytest.mark.thorough
 def test_without_answers_there_is_no_share() -> None:
-    maps = make_maps({"roughness": HALF}, status=np.full(HALF.shape, Status.NOT_CONVERGED))
-    row = pb.diagnostics.map_coverage(maps, known(roughness=0.5)).loc["roughness"]
+    status = np.full(HALF.shape, Status.NOT_CONVERGED)
+    row = coverage_of(make_maps({"roughness": HALF}, status=status), 0.5)
     assert row["unanswered"] == HALF.size
     assert row[["held_50", "held_50_low", "held_50_high"]].isna().all()
     assert row["held_50_of_read"] == 0.0
@@ -105,10 +102,10 @@ def test_every_wavelength_has_a_row_and_truths_may_have_fewer_axes() -> None:
 
 @pytest.mark.thorough
 def test_the_image_may_be_read_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
-    maps, truth = make_maps({"roughness": HALF}), known(roughness=SPREAD)
-    whole = pb.diagnostics.map_coverage(maps, truth)
+    maps = make_maps({"roughness": HALF})
+    whole = coverage_of(maps, SPREAD)
     monkeypatch.setattr(coverage, "CHUNK", 333)
-    pd.testing.assert_frame_equal(pb.diagnostics.map_coverage(maps, truth), whole)
+    pd.testing.assert_series_equal(coverage_of(maps, SPREAD), whole)
 
 
 @pytest.mark.thorough
@@ -119,29 +116,32 @@ def test_maps_that_are_still_to_be_computed_are_computed_once(monkeypatch):
         calls.append(block.shape)
         return block
 
-    chunks = dask.array.from_array(maps["roughness_quantile"].to_numpy(), chunks=(7, 20, 50))
-    lazy = maps.assign(
-        roughness_quantile=(maps["roughness_quantile"].dims, chunks.map_blocks(late, meta=chunks))
-    )
-    found = pb.diagnostics.map_coverage(lazy, known(roughness=SPREAD))
-    assert found.loc["roughness", "held_95"] == 0.95
+    quantile = maps["roughness_quantile"]
+    chunks = dask.array.from_array(quantile.to_numpy(), chunks=(7, 20, 50))
+    lazy = maps.assign(roughness_quantile=(quantile.dims, chunks.map_blocks(late, meta=chunks)))
+    assert coverage_of(lazy, SPREAD)["held_95"] == 0.95
     assert calls == [(7, 20, 50)] * 2
     monkeypatch.setattr(opening, "MOST_BYTES", 1000)
     with pytest.raises(pb.FitError, match="in chunks and take 0 GB; write them with to_zarr"):
-        pb.diagnostics.map_coverage(lazy, known(roughness=SPREAD))
+        coverage_of(lazy, SPREAD)
 
 
-def test_what_does_not_fit_is_refused() -> None:
-    maps = make_maps({"roughness": HALF})
-    for given, truth, error, words in (
-        (maps, {"albedo": 0.3}, pb.CaptureError, "leaf: it states the truth of no parameter"),
+DIFFER = r"different axes \(y 50 x x 40 and y 40 x x 50\)"
+
+
+@each(
+    ("truth", "error", "words"),
+    [
+        ({"albedo": 0.3}, pb.CaptureError, "leaf: it states the truth of no parameter"),
         (
-            maps,
             {"roughness": SPREAD.T},
             pb.CaptureError,
-            r"different axes \(y 50 x x 40 and y 40 x x 50\)",
+            DIFFER,
         ),
-        (xr.Dataset(), {"roughness": 0.5}, pb.FitError, "it holds no maps"),
-    ):
-        with pytest.raises(error, match=words):
-            pb.diagnostics.map_coverage(given, known(**truth))
+        (None, pb.FitError, "it holds no maps"),
+    ],
+)
+def test_what_does_not_fit_is_refused(truth, error, words) -> None:
+    maps = make_maps({"roughness": HALF}) if truth else xr.Dataset()
+    with pytest.raises(error, match=words):
+        pb.diagnostics.map_coverage(maps, known(**truth or {"roughness": 0.5}))

@@ -31,6 +31,9 @@ LINKS = {
 }
 
 
+FLAT = np.zeros(CHAINS * DRAWS)
+
+
 def tree(name, value, location, spread, bounds=None, dims=("patch",)):
     """A result with one population; values on its scale, members first, draws last."""
     grid = (CHAINS, DRAWS)
@@ -44,6 +47,12 @@ def tree(name, value, location, spread, bounds=None, dims=("patch",)):
     found = xr.DataTree.from_dict({"posterior": xr.Dataset(posterior)})
     found.attrs["polar_bayes"] = json.dumps({"method": "nuts", "bounds": bounds or {}})
     return found
+
+
+def known_population(name, location, spread=0.1):
+    """The row of a population of two members whose location and spread are known."""
+    members = np.stack([FLAT + location - spread, FLAT + location + spread])
+    return population_summary(tree(name, members, FLAT + location, FLAT + spread)).iloc[0]
 
 
 def exact_draws(readings, errors, spreads, rng, *, location=None):
@@ -142,22 +151,27 @@ def test_pooling_factor_from_none_to_all(error, low, high, rng) -> None:
     assert low - 0.01 <= factor <= high + 1e-9
 
 
-@each("name", LINKS)
-def test_a_new_member_is_drawn_from_the_population(name) -> None:
-    location = 1.6 if name == "refractive_index" else 0.2
-    flat = np.zeros(CHAINS * DRAWS)
-    members = np.stack([flat + location - 0.1, flat + location + 0.1])
-    row = population_summary(tree(name, members, flat + location, flat + 0.1)).iloc[0]
+@each(
+    ("name", "location", "between"),
+    [
+        ("refractive_index", 1.6, 0.1),
+        ("roughness", 0.2, np.exp(0.1)),
+        ("subsurface_fraction", 0.2, 0.1 * scipy.special.expit(0.2) * scipy.special.expit(-0.2)),
+    ],
+)
+def test_a_new_member_and_a_spread_have_the_unit_of_the_parameter(name, location, between) -> None:
+    row = known_population(name, location)
     expected = LINKS[name][1](scipy.stats.norm(location, 0.1).ppf([0.025, 0.975]))
     assert [row["new_q2.5"], row["new_q97.5"]] == pytest.approx(expected, rel=1e-3)
+    assert row["between"] == pytest.approx(between)
+    assert ("a factor of about 1.11" in row["meaning"]) == (name == "roughness")
 
 
 @pytest.mark.thorough
 def test_a_new_member_is_cut_not_heaped_up_at_the_bounds() -> None:
-    flat = np.zeros(CHAINS * DRAWS)
-    value = np.array([[1.22], [1.25]]) + flat
+    value = np.array([[1.22], [1.25]]) + FLAT
     bounds = {"refractive_index_location": (1.2, 2.0)}
-    (population,) = populations(tree("refractive_index", value, flat + 1.25, flat + 0.1, bounds))
+    (population,) = populations(tree("refractive_index", value, FLAT + 1.25, FLAT + 0.1, bounds))
     # By inversion on a grid: SciPy's own truncated normal is what is tested.
     at = np.linspace(1.2, 2.0, 200_001)
     mass = np.cumsum(np.exp(-0.5 * ((at - 1.25) / 0.1) ** 2))
@@ -172,45 +186,22 @@ def test_a_new_member_is_cut_not_heaped_up_at_the_bounds() -> None:
     ("said", "bounds"),
     [(None, (1.0, np.inf)), ((1.2, None), (1.2, np.inf)), ((1.25, 10), (1.25, 10))],
 )
-def test_bounds_come_from_the_prior_of_the_location(said, bounds) -> None:
-    rng = np.random.default_rng(0)
+def test_bounds_come_from_the_prior_of_the_location(said, bounds, rng) -> None:
     value = 1.5 + 0.1 * rng.standard_normal((3, CHAINS * DRAWS))
     told = {} if said is None else {"refractive_index_location": said}
-    result = tree("refractive_index", value, value[0], np.full(CHAINS * DRAWS, 0.1), told)
-    (found,) = populations(result)
+    (found,) = populations(tree("refractive_index", value, value[0], FLAT + 0.1, told))
     assert (found.low, found.high) == bounds
-
-
-@each(
-    ("name", "expected"),
-    [
-        ("refractive_index", 0.1),
-        ("roughness", np.exp(0.1)),
-        ("subsurface_fraction", 0.1 * scipy.special.expit(0.2) * scipy.special.expit(-0.2)),
-    ],
-)
-def test_what_a_spread_means_in_the_unit_of_the_parameter(name, expected) -> None:
-    flat = np.zeros(CHAINS * DRAWS)
-    members = np.stack([flat, flat + 0.1])
-    row = population_summary(tree(name, members, flat + 0.2, flat + 0.1)).iloc[0]
-    assert row["between"] == pytest.approx(expected)
-    assert ("a factor of about 1.11" in row["meaning"]) == (name == "roughness")
 
 
 @pytest.mark.thorough
 def test_every_wavelength_is_a_population_of_its_own() -> None:
-    result = pool(
-        make_result(materials=("a", "b", "c"), wavelengths=(450.0, 550.0), draws=50),
-        "refractive_index",
-        "roughness",
-    )
+    layout = {"materials": ("a", "b", "c"), "wavelengths": (450.0, 550.0), "draws": 50}
+    result = pool(make_result(**layout), "refractive_index", "roughness")
     table = population_summary(result)
     assert list(table.columns) == list(SUMMARY_COLUMNS)
     assert list(table.index) == ["roughness", "refractive_index[450]", "refractive_index[550]"]
     assert (table["members"] == 3).all()
-    assert (
-        table.loc["refractive_index[450]", "spread"] == table.loc["refractive_index[550]", "spread"]
-    )
+    assert table["spread"].iloc[1] == table["spread"].iloc[2]
     assert len(shrinkage(result)) == 9
 
 
@@ -224,13 +215,11 @@ def test_every_wavelength_is_a_population_of_its_own() -> None:
     ids=["nothing pooled", "point fit"],
 )
 def test_no_rows_where_nothing_can_be_said(result) -> None:
-    for table, columns in (
-        (population_summary(result), SUMMARY_COLUMNS),
-        (shrinkage(result), MEMBER_COLUMNS),
-    ):
+    tables = {SUMMARY_COLUMNS: population_summary(result), MEMBER_COLUMNS: shrinkage(result)}
+    for columns, table in tables.items():
         assert isinstance(table, pd.DataFrame)
         assert table.empty
-        assert list(table.columns) == list(columns)
+        assert tuple(table.columns) == columns
 
 
 def test_draws_that_are_not_finite_give_nan(rng) -> None:

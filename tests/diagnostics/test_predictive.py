@@ -11,6 +11,12 @@ from synthetic_results import SCALE, make_result, replace
 from polar_bayes.diagnostics.predictive import pit_band, predictive_checks, usable_readings
 
 SMALL = {"wavelengths": (), "views": 20, "draws": 150}
+DOP = SMALL | {"variables": ("dop",)}
+
+
+def check_of(tree):
+    """The check of the degree of polarization."""
+    return predictive_checks(tree)["dop"]
 
 
 def leaves(band) -> bool:
@@ -21,26 +27,22 @@ def leaves(band) -> bool:
 
 def test_a_calibrated_fit_raises_no_more_alarms_than_it_should() -> None:
     """Of 60 calibrated fits 5% may leave the band: more than 9 has probability 0.0013."""
-    alarms = 0
-    for seed in range(60):
-        check = predictive_checks(make_result(**SMALL, variables=("dop",), seed=seed))["dop"]
-        alarms += leaves(pit_band(check.loo.pit))
+    alarms = sum(
+        leaves(pit_band(check_of(make_result(**DOP, seed=seed)).loo.pit)) for seed in range(60)
+    )
     assert alarms <= stats.binom.isf(0.002, 60, 0.05)
 
 
 @pytest.mark.thorough
 def test_pooled_pit_of_calibrated_fits_is_uniform() -> None:
     """Kolmogorov-Smirnov on one reading from each of 100 fits, at a false-alarm rate of 0.001."""
-    values = [
-        predictive_checks(make_result(**SMALL, variables=("dop",), seed=seed))["dop"].loo.pit[7]
-        for seed in range(100)
-    ]
+    values = [check_of(make_result(**DOP, seed=seed)).loo.pit[7] for seed in range(100)]
     assert stats.kstest(values, "uniform").pvalue > 1e-3
 
 
 @each(("noise", "first_side"), [(3.0, "above"), (0.25, "below")])
 def test_readings_that_scatter_otherwise_leave_the_band(noise: float, first_side: str) -> None:
-    check = predictive_checks(make_result(noise=noise))["dop"]
+    check = check_of(make_result(noise=noise))
     band = pit_band(check.loo.pit)
     assert leaves(band)
     early = band.difference[: len(band.at) // 4]
@@ -48,7 +50,7 @@ def test_readings_that_scatter_otherwise_leave_the_band(noise: float, first_side
 
 
 def test_coverage_and_residuals() -> None:
-    check = predictive_checks(make_result(views=60))["dop"]
+    check = check_of(make_result(views=60))
     for probability, share in check.coverage.items():
         chance = np.sqrt(probability * (1.0 - probability) / check.count)
         assert abs(share - probability) < 4.0 * chance
@@ -56,8 +58,8 @@ def test_coverage_and_residuals() -> None:
 
 
 def test_leave_one_out_agrees_with_arviz() -> None:
-    tree = make_result(**SMALL, variables=("dop",))
-    loo = predictive_checks(tree)["dop"].loo
+    tree = make_result(**DOP)
+    loo = check_of(tree).loo
     theirs = arviz_stats.loo(tree, var_name="dop", pointwise=True)
     assert loo.elpd == pytest.approx(theirs.elpd, rel=1e-8)
     assert loo.standard_error == pytest.approx(theirs.se, rel=1e-8)
@@ -69,26 +71,21 @@ def test_leave_one_out_agrees_with_arviz() -> None:
 
 def test_chains_that_stand_still_are_not_relied_upon() -> None:
     """Two values in 600 draws; where all draws are alike, each is as good as any other."""
-    tree = make_result(**SMALL, variables=("dop",))
+    tree = make_result(**DOP)
     still = np.zeros(tree["log_likelihood"]["dop"].shape)
-    alike = predictive_checks(replace(tree, "log_likelihood", "dop", still))["dop"].loo
-    assert alike.unreliable == 0
+    assert check_of(replace(tree, "log_likelihood", "dop", still)).loo.unreliable == 0
     still[:2] = 1.0
-    assert (
-        predictive_checks(replace(tree, "log_likelihood", "dop", still))["dop"].loo.unreliable == 20
-    )
+    assert check_of(replace(tree, "log_likelihood", "dop", still)).loo.unreliable == 20
 
 
 @pytest.mark.thorough
 def test_laplace_weights_correct_the_leave_one_out() -> None:
     """Draws from a wrong normal with their weights say what draws from the posterior say."""
-    right = make_result(**SMALL, variables=("dop",))
-    rng = np.random.default_rng(5)
-    keep = rng.normal(size=(4, 150))
-    tree = make_result(**SMALL, variables=("dop",), method="laplace")
-    plain = predictive_checks(replace(tree, "sample_stats", "log_weight", 0.0 * keep))["dop"].loo
-    assert plain.elpd == pytest.approx(predictive_checks(right)["dop"].loo.elpd, abs=0.5)
-    tilted = predictive_checks(replace(tree, "sample_stats", "log_weight", keep))["dop"].loo
+    right, tree = make_result(**DOP), make_result(**DOP, method="laplace")
+    keep = np.random.default_rng(5).normal(size=(4, 150))
+    plain = check_of(replace(tree, "sample_stats", "log_weight", 0.0 * keep)).loo
+    assert plain.elpd == pytest.approx(check_of(right).loo.elpd, abs=0.5)
+    tilted = check_of(replace(tree, "sample_stats", "log_weight", keep)).loo
     assert tilted.elpd != plain.elpd
     assert np.isfinite(tilted.pit).all()
 
@@ -129,46 +126,40 @@ def test_few_readings(views: int) -> None:
 
 
 @pytest.mark.thorough
-def test_a_band_needs_two_values() -> None:
-    assert pit_band(np.array([0.5])) is None
-    assert pit_band(np.array([np.nan, 0.5])) is None
-    assert pit_band(np.array([])) is None
+def test_a_band_needs_two_values_and_many_are_fast() -> None:
+    for values in ([0.5], [np.nan, 0.5], []):
+        assert pit_band(np.array(values)) is None
     assert not leaves(pit_band(np.array([0.3, 0.8])))
     assert leaves(pit_band(np.full(50, 0.5)))
-
-
-@pytest.mark.thorough
-def test_many_readings_are_fast_and_calibrated() -> None:
-    values = np.random.default_rng(1).uniform(size=20_000)
-    band = pit_band(values)
+    band = pit_band(np.random.default_rng(1).uniform(size=20_000))
     assert not leaves(band)
     assert len(band.at) < 1000
 
 
 @pytest.mark.thorough
 def test_constant_predictions_and_readings() -> None:
-    tree = make_result(**SMALL, variables=("dop",))
+    tree = make_result(**DOP)
     for group in ("posterior_predictive", "noise_free", "log_likelihood"):
         shape = tree[group].to_dataset()["dop"].shape
         tree = replace(tree, group, "dop", np.full(shape, 0.3))
     tree = replace(tree, "observed_data", "dop", np.full(20, 0.3))
-    check = predictive_checks(tree)["dop"]
+    check = check_of(tree)
     assert check.residual_rms < 1e-12
     assert check.loo.unreliable == 0
     assert ((check.pit >= 0.0) & (check.pit <= 1.0)).all()
 
 
 def test_predictions_that_are_not_numbers_give_no_check() -> None:
-    tree = make_result(**SMALL, variables=("dop",))
+    tree = make_result(**DOP)
     predicted = tree["posterior_predictive"].to_dataset()["dop"].to_numpy().copy()
     predicted[0, 0] = np.nan
-    check = predictive_checks(replace(tree, "posterior_predictive", "dop", predicted))["dop"]
+    check = check_of(replace(tree, "posterior_predictive", "dop", predicted))
     assert check.pit.size == 0
     assert check.loo is None
 
 
 def test_a_point_fit_has_residuals_only() -> None:
-    check = predictive_checks(make_result(method="point"))["dop"]
+    check = check_of(make_result(method="point"))
     assert check.residual_rms == pytest.approx(SCALE["dop"], rel=0.3)
     assert check.pit.size == 0
     assert check.coverage == {}

@@ -30,26 +30,24 @@ def test_verdicts() -> None:
     assert table.loc["refractive_index[550]", "verdict"] == "determined"
     assert table.loc["discrepancy_weights[2]", "verdict"] == "not determined"
     assert list(table.index[:2]) == ["roughness", "subsurface_fraction"]
-
-
-def test_a_posterior_equal_to_the_prior_is_not_determined() -> None:
-    tree = make_result()
     draws = np.random.default_rng(0).normal(*PRIOR["exposure"], (4, 250))
-    table = sensitivity(replace(tree, "posterior", "exposure", draws))
-    assert table.loc["exposure", "verdict"] == "not determined"
+    as_prior = sensitivity(replace(make_result(), "posterior", "exposure", draws))
+    assert as_prior.loc["exposure", "verdict"] == "not determined"
 
 
 def with_prior_and_posterior(prior: np.ndarray, posterior: np.ndarray):
+    """The row of a parameter with these draws."""
     tree = replace(make_result(), "prior", "exposure", prior.reshape(1, 500))
-    return sensitivity(replace(tree, "posterior", "exposure", posterior.reshape(4, 250)))
+    tree = replace(tree, "posterior", "exposure", posterior.reshape(4, 250))
+    return sensitivity(tree).loc["exposure"]
 
 
 @each("scale", [np.log, np.exp, lambda x: x])
 def test_the_verdict_is_the_same_for_a_parameter_and_its_logarithm(scale) -> None:
     rng = np.random.default_rng(1)
     prior, posterior = np.exp(rng.normal(0.0, 1.0, 500)), np.exp(rng.normal(0.5, 0.2, 1000))
-    row = with_prior_and_posterior(scale(prior), scale(posterior)).loc["exposure"]
-    plain = with_prior_and_posterior(prior, posterior).loc["exposure"]
+    row = with_prior_and_posterior(scale(prior), scale(posterior))
+    plain = with_prior_and_posterior(prior, posterior)
     assert row["prior_inside"] == pytest.approx(plain["prior_inside"], abs=0.01)
     assert row["verdict"] == plain["verdict"] == "determined"
 
@@ -70,18 +68,15 @@ def test_no_remark_contradicts_that_data_determine_a_parameter(verdict, likeliho
 def test_a_posterior_in_the_tail_of_its_prior_is_not_the_prior() -> None:
     """As wide as the prior, but where the prior did not expect it: the data put it there."""
     rng = np.random.default_rng(1)
-    prior, posterior = np.exp(rng.normal(-1.0, 0.5, 500)), rng.normal(1.24, 0.2, 1000)
-    row = with_prior_and_posterior(prior, posterior).loc["exposure"]
+    row = with_prior_and_posterior(np.exp(rng.normal(-1.0, 0.5, 500)), rng.normal(1.24, 0.2, 1000))
     assert row["width_left"] > 0.7
     assert row["verdict"] == "determined"
     assert "outside the prior's 95%" in row["remark"]
-
-
-def test_a_posterior_over_decades_of_a_wide_prior_is_not_determined() -> None:
-    """Narrow beside the prior's upper end, and yet most of what the prior allowed."""
+    # Over decades of a wide prior: narrow beside its upper end, and yet most of what it allowed.
     rng = np.random.default_rng(1)
-    prior, posterior = np.exp(rng.normal(0.0, 3.0, 500)), np.exp(rng.normal(-1.0, 2.0, 1000))
-    row = with_prior_and_posterior(prior, posterior).loc["exposure"]
+    row = with_prior_and_posterior(
+        np.exp(rng.normal(0.0, 3.0, 500)), np.exp(rng.normal(-1.0, 2.0, 1000))
+    )
     assert row["width_left"] < 0.2
     assert row["verdict"] != "determined"
 

@@ -23,6 +23,7 @@ from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.compare import compare_without
 from polar_bayes.diagnostics.predictive import predictive_checks
 from polar_bayes.diagnostics.sensitivity import sensitivity
+from polar_bayes.diagnostics.view import view_of
 from polar_bayes.inference.result import assemble, posterior_of
 from polar_bayes.observation.data import ANGLES
 
@@ -57,6 +58,7 @@ RESULTS = (
     make_result(views=4, draws=60, method="laplace", wavelengths=()),
     make_result(views=4, method="point", wavelengths=()),
 )
+THAT = view_of(RESULTS[1])
 CALIBRATION = make_calibration(count=40, wavelengths=(450.0, 550.0), readings={"dop": 1.0})
 
 
@@ -82,7 +84,7 @@ OF_FITS = (
     pb.diagnostics.stack_readings,
     predictive_checks,
     sensitivity,
-    lambda tree: pb.diagnostics.compare_fits({"this": tree, "that": RESULTS[1]}),
+    lambda tree: pb.diagnostics.compare_fits({"this": tree, "that": THAT}),
 )
 OF_CALIBRATIONS = (
     pb.summary,
@@ -106,25 +108,22 @@ def check_mutations(trees, functions, random, count):
     return refused
 
 
-@pytest.mark.parametrize(
-    "seed", [0, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (1, 2))]
+DAMAGED = [
+    *((RESULTS, OF_FITS, [11, seed], 50, range(16, 45)) for seed in range(3)),
+    *(([CALIBRATION], OF_CALIBRATIONS, [12, seed], 40, range(21, 40)) for seed in range(2)),
+    ([make_accuracy()], OF_STUDIES, [13], 120, range(41, 120)),
+]
+"""Trees, what is done with them, a seed, how many are damaged, and how many are refused."""
+
+
+@each(
+    ("trees", "functions", "seed", "count", "refused"),
+    DAMAGED,
+    ids=[str(seed) for _, _, seed, *_ in DAMAGED],
+    quick=1,
 )
-def test_a_damaged_fit_is_refused_in_one_line_or_works(seed):
-    random = np.random.default_rng([11, seed])
-    assert 15 < check_mutations(RESULTS, OF_FITS, random, 50) < 45
-
-
-@pytest.mark.thorough
-@each("seed", range(2))
-def test_a_damaged_calibration_is_refused_in_one_line_or_works(seed):
-    random = np.random.default_rng([12, seed])
-    assert 20 < check_mutations([CALIBRATION], OF_CALIBRATIONS, random, 40) < 40
-
-
-@pytest.mark.thorough
-def test_a_damaged_study_is_refused_in_one_line_or_works():
-    random = np.random.default_rng([13])
-    assert 40 < check_mutations([make_accuracy()], OF_STUDIES, random, 120) < 120
+def test_a_damaged_result_is_refused_in_one_line_or_works(trees, functions, seed, count, refused):
+    assert check_mutations(trees, functions, np.random.default_rng(seed), count) in refused
 
 
 # Matplotlib says that an axis from 1e-300 to 1e300 overflows; the figure is drawn all the same.
@@ -133,8 +132,8 @@ def test_a_damaged_study_is_refused_in_one_line_or_works():
 @each("seed", range(8))
 def test_many_damaged_results_are_refused_in_one_line_or_work(tmp_path, seed):
     random = np.random.default_rng([14, seed])
+    page = lambda tree: pb.report(tree, tmp_path / "report")  # noqa: E731
     figures = (
-        lambda tree: pb.report(tree, tmp_path / "report"),
         pb.plots.plot_pairs,
         pb.plots.plot_ranks,
         pb.plots.plot_prior_posterior,
@@ -145,15 +144,10 @@ def test_many_damaged_results_are_refused_in_one_line_or_work(tmp_path, seed):
         lambda tree: pb.plots.plot_spectrum(tree, "absorption"),
         lambda tree: pb.inference.predict_spectrum(tree, [500.0]),
     )
-    check_mutations(RESULTS, (*OF_FITS, *figures), random, 100)
-    pages = (
-        *OF_CALIBRATIONS,
-        pb.plots.plot_calibration,
-        lambda t: pb.report(t, tmp_path / "report"),
-    )
+    check_mutations(RESULTS, (*OF_FITS, page, *figures), random, 100)
+    pages = (*OF_CALIBRATIONS, pb.plots.plot_calibration, page)
     check_mutations([CALIBRATION], pages, random, 30)
-    pages = (*OF_STUDIES, pb.plots.plot_accuracy, lambda tree: pb.report(tree, tmp_path / "report"))
-    check_mutations([make_accuracy()], pages, random, 30)
+    check_mutations([make_accuracy()], (*OF_STUDIES, pb.plots.plot_accuracy, page), random, 30)
 
 
 # --- provenance -------------------------------------------------------------------------------
@@ -290,19 +284,19 @@ def test_other_kinds_of_tree_are_named(tmp_path):
                 pb.FitError, match=r"it holds no (fit|readings); give the tree that"
             ):
                 function(wrong)
-    with pytest.raises(pb.FitError, match="calibration: it holds no calibration; give the tree"):
-        check_calibration(MANY)
-    pb.save(CALIBRATION, tmp_path / "sbc.nc")
-    with pytest.raises(pb.FitError, match=r"sbc\.nc: it holds no fit; give the file that"):
-        pb.load(tmp_path / "sbc.nc", "fit")
-    with pytest.raises(pb.FitError, match="a str is no result"):
-        pb.save("fit", tmp_path / "fit.nc")
     odd = MANY.copy()
     odd.attrs["what"] = {"a": 1}
-    with pytest.raises(pb.FitError, match=r"netCDF cannot hold it \(.*\); store numbers"):
-        pb.save(odd, tmp_path / "fit.nc")
-    with pytest.raises(pb.FitError, match="compare_fits: b: it holds no fit"):
-        pb.diagnostics.compare_fits({"a": MANY, "b": CALIBRATION})
+    for call, said in (
+        (lambda: check_calibration(MANY), "calibration: it holds no calibration; give the tree"),
+        (lambda: pb.save("fit", tmp_path / "fit.nc"), "a str is no result"),
+        (lambda: pb.save(odd, tmp_path / "fit.nc"), r"netCDF cannot hold it \(.*\); store numbers"),
+        (
+            lambda: pb.diagnostics.compare_fits({"a": MANY, "b": CALIBRATION}),
+            "compare_fits: b: it holds no fit",
+        ),
+    ):
+        with pytest.raises(pb.FitError, match=said):
+            call()
 
 
 def test_a_tree_that_arviz_made_is_summed_up():
@@ -323,11 +317,8 @@ def test_a_tree_that_arviz_made_is_summed_up():
         pb.plots.plot_readings(tree, "dop")
 
 
-OPTIONAL = sorted(set(RESULTS[1].children) - {"posterior"})
-
-
 @pytest.mark.thorough
-@each("group", OPTIONAL)
+@each("group", sorted(set(RESULTS[1].children) - {"posterior"}))
 def test_any_group_but_the_posterior_may_be_missing(group):
     tree = RESULTS[1].copy()
     del tree[group]
@@ -411,10 +402,8 @@ def test_a_file_gives_back_what_was_saved(tmp_path):
         pb.save(tree, path)
         with xr.open_datatree(path, engine="netcdf4", decode_times=False) as opened:
             assert set(opened.attrs) == {"polar_bayes"}
-            read = opened.load()
-        load = (pb.load, pb.load, pb.load)[max(0, number - 2)]
-        xr.testing.assert_identical(load(path), read)
-        assert set(read.children) == set(tree.children)
+            xr.testing.assert_identical(pb.load(path), opened.load())
+            assert set(opened.children) == set(tree.children)
 
 
 @each("part", ["posterior/roughness", "posterior/wavelength", "provenance"])

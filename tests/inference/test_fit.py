@@ -1,5 +1,6 @@
 """What a fit returns, refuses and records."""
 
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -10,7 +11,8 @@ import pytest
 import xarray as xr
 from cases import each
 from numpyro import distributions as dist
-from plates import LINKS, PLATE, plate_capture
+from plate_images import plate_image
+from plates import LINKS, ON_PLATE, PLATE, plate_capture
 
 import polar_bayes as pb
 from polar_bayes.inference.problem import Problem
@@ -30,16 +32,24 @@ def capture() -> xr.Dataset:
 
 
 @pytest.fixture(scope="module")
-def short(capture: xr.Dataset) -> xr.DataTree:
-    return pb.fit(capture, scene=PLATE, links=LINKS, method=SHORT, seed=7)
+def heard() -> list[tuple[str, float]]:
+    """What `short` reports while it is fitted."""
+    return []
 
 
-def test_every_group_is_there_with_labels(short: xr.DataTree) -> None:
+@pytest.fixture(scope="module")
+def short(capture: xr.Dataset, heard: list) -> xr.DataTree:
+    return pb.fit(capture, **ON_PLATE, method=SHORT, seed=7, progress=lambda *at: heard.append(at))
+
+
+def test_every_group_is_there_with_labels_and_every_stage_is_reported(short, heard) -> None:
     assert set(short.children) == GROUPS
     assert dict(short["posterior"].sizes) == {"chain": 2, "draw": 100}
     assert short["posterior_predictive"]["q"].dims == ("chain", "draw", "view")
     assert short["log_likelihood"]["q"].dims == ("chain", "draw", "view")
     assert short["posterior"]["refractive_index"].attrs["units"] == "1"
+    assert {stage for stage, _ in heard} >= {"searching for modes", "sampling"}
+    assert all(0.0 <= fraction <= 1.0 for _, fraction in heard)
 
 
 def test_provenance_says_enough_to_repeat_the_fit(short: xr.DataTree, capture: xr.Dataset) -> None:
@@ -48,22 +58,16 @@ def test_provenance_says_enough_to_repeat_the_fit(short: xr.DataTree, capture: x
     assert said["swapped"] == ["scene", "links"]
     assert set(said["versions"]) >= {"polar_bayes", "jax", "numpyro", "arviz"}
     settings = pb.methods.Nuts(**said["settings"])
-    again = pb.fit(capture, scene=PLATE, links=LINKS, method=settings, seed=said["seed"])
+    again = pb.fit(capture, **ON_PLATE, method=settings, seed=said["seed"])
     xr.testing.assert_equal(short["posterior"].to_dataset(), again["posterior"].to_dataset())
 
 
 @pytest.mark.thorough
-def test_threads_do_not_change_a_bit(short: xr.DataTree, capture: xr.Dataset) -> None:
-    alone = pb.methods.Nuts(chains=2, warmup=100, draws=100, most_draws=100, block=50, threads=1)
-    other = pb.fit(capture, scene=PLATE, links=LINKS, method=alone, seed=7)
-    xr.testing.assert_equal(short["posterior"].to_dataset(), other["posterior"].to_dataset())
-
-
-@pytest.mark.thorough
-def test_another_seed_gives_other_draws(short: xr.DataTree, capture: xr.Dataset) -> None:
-    other = pb.fit(capture, scene=PLATE, links=LINKS, method=SHORT, seed=8)
-    name = "refractive_index"
-    assert not np.array_equal(short["posterior"][name], other["posterior"][name])
+@each(("change", "seed"), [({"threads": 1}, 7), ({}, 8)])
+def test_threads_do_not_change_a_bit_and_another_seed_does(short, capture, change, seed) -> None:
+    settings = dataclasses.replace(SHORT, **change)
+    other = pb.fit(capture, **ON_PLATE, method=settings, seed=seed)
+    assert short["posterior"].equals(other["posterior"]) == (seed == 7)
 
 
 @pytest.mark.thorough
@@ -76,15 +80,15 @@ def test_a_fit_that_is_too_short_says_so(short: xr.DataTree) -> None:
 
 def test_the_global_precision_is_left_alone(capture: xr.Dataset) -> None:
     with jax.enable_x64(False):
-        result = pb.fit(capture, scene=PLATE, links=LINKS, method="laplace", seed=1)
+        result = pb.fit(capture, **ON_PLATE, method="laplace", seed=1)
         assert jnp.zeros(()).dtype == jnp.float32
     assert result["posterior"]["refractive_index"].dtype == np.float64
 
 
 @pytest.mark.thorough
 def test_single_precision_finds_the_same_posterior(capture: xr.Dataset) -> None:
-    double = pb.fit(capture, scene=PLATE, links=LINKS, seed=1)
-    single = pb.fit(capture, scene=PLATE, links=LINKS, seed=1, precision="single")
+    double = pb.fit(capture, **ON_PLATE, seed=1)
+    single = pb.fit(capture, **ON_PLATE, seed=1, precision="single")
     assert single["posterior"]["refractive_index"].dtype == np.float32
     for name in ("refractive_index", "subsurface_fraction"):
         one, two = (tree["posterior"][name].to_numpy() for tree in (double, single))
@@ -103,32 +107,24 @@ def test_laplace_says_where_it_is_not_to_be_trusted(capture, belief, trusted):
         with numpyro.plate("view", data.shape[-1]):
             numpyro.sample("q", dist.Normal(0.0, 1.0), obs=data.readings["q"])
 
-    result = pb.fit(capture, model=tails, scene=PLATE, links=LINKS, method="laplace", seed=1)
+    result = pb.fit(capture, model=tails, **ON_PLATE, method="laplace", seed=1)
     verdict = pb.verdict(result)
     assert verdict.converged  # the readings are not judged: they stand for no scene
     assert any("Pareto k" in caution for caution in verdict.cautions) != trusted
 
 
-def test_masked_views_are_counted_and_do_not_matter(capture: xr.Dataset) -> None:
-    poisoned = capture.copy(deep=True)
-    poisoned["valid"] = ("view", np.arange(12) != 4)
+def test_views_that_are_masked_or_beyond_the_limit_are_counted_and_do_not_matter(capture) -> None:
+    poisoned = capture.assign(valid=("view", np.arange(12) != 4)).copy(deep=True)
     poisoned["q"][4] = np.nan
-    result = pb.fit(poisoned, scene=PLATE, links=LINKS, method="laplace", seed=1)
+    before = poisoned.copy(deep=True)
+    result = pb.fit(poisoned, **ON_PLATE, method="laplace", largest_view_zenith=60.0, seed=1)
     counts = provenance_of(result)["counts"]
     assert counts["masked"] == 1
-    assert counts["used"] == 11
+    assert counts["used"] == int((capture["view_zenith"] <= 60.0).sum()) - 1
     assert np.isfinite(result["posterior"]["refractive_index"]).all()
     assert np.isnan(result["observed_data"]["q"][4])
     assert (result["log_likelihood"]["q"][..., 4] == 0.0).all()
-
-
-@pytest.mark.thorough
-def test_views_beyond_the_limit_are_set_aside_and_counted(capture: xr.Dataset) -> None:
-    result = pb.fit(
-        capture, scene=PLATE, links=LINKS, method="laplace", largest_view_zenith=60.0, seed=1
-    )
-    counts = provenance_of(result)["counts"]
-    assert counts["used"] == int((capture["view_zenith"] <= 60.0).sum())
+    xr.testing.assert_equal(before, poisoned)
 
 
 @pytest.mark.thorough
@@ -143,13 +139,6 @@ def test_two_views_have_a_proper_posterior() -> None:
     prior = result["prior"]["intensity_scale"].to_numpy()
     # Two readings and a free exposure say little about their noise: within the prior's range.
     assert np.quantile(prior, 0.005) < np.median(scale) < np.quantile(prior, 0.995)
-
-
-@pytest.mark.thorough
-def test_the_capture_is_not_changed(capture: xr.Dataset) -> None:
-    before = capture.copy(deep=True)
-    pb.fit(capture, scene=PLATE, links=LINKS, method="laplace", seed=1)
-    xr.testing.assert_equal(before, capture)
 
 
 @each(
@@ -178,33 +167,14 @@ def test_the_capture_is_not_changed(capture: xr.Dataset) -> None:
     ],
 )
 def test_what_cannot_be_fitted_is_refused_with_the_mend(capture, settings, says):
-    arguments = {"scene": PLATE, "links": LINKS, **settings}
     with pytest.raises(pb.PolarBayesError, match=says) as caught:
-        pb.fit(capture, **arguments)
+        pb.fit(capture, **ON_PLATE | settings)
     assert "\n" not in str(caught.value)
 
 
-def test_an_image_is_refused_with_the_way_out(capture: xr.Dataset) -> None:
-    image = capture.expand_dims(y=2, x=2)
-    image = image.drop_vars([n for n in image if "zenith" in n or "azimuth" in n]).merge(
-        capture[["view_zenith", "view_azimuth", "light_zenith", "light_azimuth"]]
-    )
+def test_an_image_is_refused_with_the_way_out() -> None:
     with pytest.raises(pb.CaptureError, match="average a region"):
-        pb.fit(image, scene=PLATE, links=LINKS)
-
-
-def test_progress_reports_every_stage(capture: xr.Dataset) -> None:
-    heard: list[tuple[str, float]] = []
-    pb.fit(
-        capture,
-        scene=PLATE,
-        links=LINKS,
-        method=SHORT,
-        seed=7,
-        progress=lambda stage, fraction: heard.append((stage, fraction)),
-    )
-    assert {stage for stage, _ in heard} >= {"searching for modes", "sampling"}
-    assert all(0.0 <= fraction <= 1.0 for _, fraction in heard)
+        pb.fit(plate_image(2, 2), **ON_PLATE)
 
 
 @pytest.mark.thorough

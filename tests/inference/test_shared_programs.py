@@ -9,6 +9,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from cases import each
 from compilations import compilations, compiled_fast
 from numpyro import distributions as dist
 from numpyro import handlers
-from plates import LINKS, PLATE, plate_capture, plates
+from plates import LINKS, ON_PLATE, PLATE, plate_capture, plates
 from spectral_plates import spectral_plate
 
 import polar_bayes as pb
@@ -94,7 +95,7 @@ def test_other_readings_compile_nothing(case: str, compiled: list[str]) -> None:
     model, method, capture = CASES[case]
 
     def fit(seed: int, views: int) -> xr.DataTree:
-        asked = {"model": model, "method": method, "scene": PLATE, "links": LINKS}
+        asked = ON_PLATE | {"model": model, "method": method}
         return pb.fit(capture(seed).isel(view=slice(views)), seed=seed, **asked)
 
     first = fit(1, 6)
@@ -113,7 +114,7 @@ def test_other_readings_compile_nothing(case: str, compiled: list[str]) -> None:
 )
 def test_what_was_compiled_for_others_gives_the_same_draws(method) -> None:
     """A fit is the same to the bit, whether or not another one compiled it."""
-    asked = {"method": method, "scene": PLATE, "links": LINKS, "seed": 3}
+    asked = ON_PLATE | {"method": method, "seed": 3}
     before = pb.fit(one(1), **asked)
     pb.fit(one(2), **asked)
     again = pb.fit(one(1), **asked)
@@ -193,6 +194,7 @@ def shifted(by: float) -> Callable:
 
 WIDE, WIDER = ({"refractive_index": dist.Uniform(1.3, high)} for high in (1.8, 1.9))
 STUDENT = pb.links.StokesLink(stated_errors=True, degrees_of_freedom=4.0)
+LONGER = plate_capture(np.linspace(30.0, 75.0, 7), 0.02, 1)
 SAME: dict[str, tuple[dict, dict]] = {
     "defaults": ({}, {}),
     "a value held": ({"model": held(1.0)}, {"model": held(1.0)}),
@@ -207,6 +209,7 @@ OTHER: dict[str, tuple[dict, dict]] = {
     "a link": ({}, {"links": {"q": STUDENT}}),
     "a scene": ({}, {"scene": pb.Scene(surface=pb.SmoothSurface())}),
     "the precision": ({}, {"precision": "single"}),
+    "a layout": ({}, {"capture": LONGER}),
 }
 
 
@@ -235,24 +238,18 @@ def test_a_story_is_told_to_the_first_capture_of_a_layout_only(monkeypatch):
 
 @each("what", OTHER)
 def test_another_question_shares_nothing(what: str) -> None:
-    first, second = OTHER[what]
-    assert compiled_model(one(1), **first) is not compiled_model(one(1), **second)
-
-
-@pytest.mark.thorough
-def test_another_layout_shares_nothing() -> None:
-    longer = plate_capture(np.linspace(30.0, 75.0, 7), 0.02, 1)
-    assert compiled_model(one(1)) is not compiled_model(longer)
+    first, second = ({"capture": one(1), **asked} for asked in OTHER[what])
+    assert compiled_model(**first) is not compiled_model(**second)
 
 
 @pytest.mark.thorough
 def test_how_a_scene_was_chosen_does_not_count() -> None:
-    parts = {field.name: getattr(PLATE, field.name) for field in dataclasses.fields(PLATE)}
-    chosen = [ChosenScene(**parts) for _ in range(2)]
-    for number, scene in enumerate(chosen):
+    keys = set()
+    for number in range(2):
+        scene = ChosenScene(**vars(PLATE))
         object.__setattr__(scene, "ledger", xr.Dataset({"cost": number}))
-    keys = [ModelParts(per_material, scene, {}, LINKS).key() for scene in chosen]
-    assert keys[0] == keys[1]
+        keys.add(ModelParts(per_material, scene, {}, LINKS).key())
+    assert len(keys) == 1
 
 
 SOURCE = """
@@ -322,24 +319,19 @@ def test_fits_side_by_side_leave_warnings_as_they_were() -> None:
     """The first ends before the second does: neither may undo what the other needs."""
     first_ended, second_began = threading.Event(), threading.Event()
     before = list(warnings.filters)
-    heard: list[str] = []
 
     def second() -> None:
         with ignore_line_search_warnings():
             second_began.set()
             first_ended.wait(10.0)
-            try:
-                warnings.warn("The line search algorithm did not converge", stacklevel=1)
-            except UserWarning as warning:
-                heard.append(str(warning))
+            warnings.warn("The line search algorithm did not converge", stacklevel=1)
 
-    thread = threading.Thread(target=second)
-    with ignore_line_search_warnings():
-        thread.start()
-        assert second_began.wait(10.0)
-    first_ended.set()
-    thread.join()
-    assert heard == []
+    with ThreadPoolExecutor(1) as pool:
+        with ignore_line_search_warnings():
+            running = pool.submit(second)
+            assert second_began.wait(10.0)
+        first_ended.set()
+        running.result()  # a warning is an error
     assert list(warnings.filters) == before
 
 

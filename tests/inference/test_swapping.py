@@ -10,7 +10,7 @@ from cases import each
 from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer.reparam import LocScaleReparam
-from plates import LINKS, PLATE, plate_capture
+from plates import ON_PLATE, plate_capture
 
 import polar_bayes as pb
 from polar_bayes.inference.result import provenance_of
@@ -29,7 +29,7 @@ def capture() -> xr.Dataset:
 
 
 def fit(capture: xr.Dataset, **asked) -> xr.DataTree:
-    return pb.fit(capture, **{"scene": PLATE, "links": LINKS, "method": FEW} | asked)
+    return pb.fit(capture, **ON_PLATE | {"method": FEW} | asked)
 
 
 def mean(result: xr.DataTree, name: str) -> float:
@@ -116,16 +116,11 @@ MOVED = handlers.reparam(POOLED, config={"subsurface_fraction_base": LocScaleRep
 
 
 @pytest.mark.thorough
-def test_by_reparam(plates: xr.Dataset) -> None:
-    result = fit(plates, model=MOVED, method="laplace")
-    assert provenance_of(result)["model"] == "reparam(Hierarchical)"
-    assert "subsurface_fraction_base_decentered" in result["posterior"]
-
-
-@pytest.mark.thorough
 def test_by_reparam_the_posterior_stays(plates: xr.Dataset) -> None:
     careful = pb.methods.Nuts(target_acceptance=0.99)
     two = [fit(plates, model=model, method=careful, seed=2) for model in (POOLED, MOVED)]
+    assert provenance_of(two[1])["model"] == "reparam(Hierarchical)"
+    assert "subsurface_fraction_base_decentered" in two[1]["posterior"]
     assert all(pb.verdict(result).passed for result in two)
     for name in ("refractive_index", "subsurface_fraction_spread"):
         one, other = (result["posterior"][name].to_numpy() for result in two)

@@ -55,14 +55,19 @@ def test_blocks_of_any_size_give_the_same_bits(image, plan, whole, block):
     assert_same_bits(mapped(image, plan, block), whole)
 
 
+def assert_without_answer(pixels: xr.Dataset, status: Status) -> None:
+    assert (pixels["status"] == status).all()
+    assert (pixels["method"] == MethodUsed.NONE).all()
+    assert (pixels["steps"] == 0).all()
+    own = [f"{name}{ending}" for name in NAMES for ending in ("", "_sd", "_quantile")]
+    assert all(np.isnan(pixels[name]).all() for name in (*own, "pareto_k", "ess", "condition"))
+
+
 @pytest.mark.thorough
 def test_a_block_in_which_nothing_was_read_is_masked(image: xr.Dataset, plan: MapPlan) -> None:
     """A corner of a picture, for example, beside what is shown."""
     nothing = with_pixel_numbers(image.assign(valid=xr.zeros_like(image["q"], bool))).isel(y=[1])
-    maps = fit_block(nothing, plan)
-    assert (maps["status"] == Status.MASKED).all()
-    assert (maps["method"] == MethodUsed.NONE).all()
-    assert all(np.isnan(maps[name]).all() for name in (*NAMES, "pareto_k"))
+    assert_without_answer(fit_block(nothing, plan), Status.MASKED)
 
 
 @pytest.mark.thorough
@@ -132,15 +137,7 @@ def test_bad_pixels_are_told_apart_and_poison_no_neighbor(image, whole, compiled
     gone = {(0, 0): Status.MASKED, (0, 1): Status.MASKED, (1, 20): Status.MASKED}
     gone |= {(1, 21): Status.TOO_FEW_VIEWS, (1, 22): Status.TOO_FEW_VIEWS}
     for (y, x), status in gone.items():
-        pixel = maps.isel(y=y, x=x)
-        assert pixel["status"] == status
-        assert pixel["method"] == MethodUsed.NONE
-        assert pixel["steps"] == 0
-        for name in (*NAMES, "pareto_k", "ess", "condition"):
-            assert np.isnan(pixel[name])
-        for name in NAMES:
-            assert np.isnan(pixel[f"{name}_sd"])
-            assert np.isnan(pixel[f"{name}_quantile"]).all()
+        assert_without_answer(maps.isel(y=y, x=x), status)
     assert int((maps["status"] == Status.MASKED).sum()) == 3
     assert int((maps["status"] == Status.TOO_FEW_VIEWS).sum()) == 2
     fewer = [(2, 42), (2, 40)]

@@ -12,7 +12,7 @@ import xarray as xr
 from cases import each
 from numpyro import distributions as dist
 from numpyro import handlers
-from plate_images import ASKED, plate_image
+from plate_images import ASKED, backwards, plate_image
 from plates import PLATE
 
 import polar_bayes as pb
@@ -21,9 +21,6 @@ from polar_bayes.inference.request import resolve
 from polar_bayes.inference.scoring import exact_derivatives, scoring_derivatives
 from polar_bayes.models.per_material import per_material
 from polar_bayes.observation.data import Observations, observe
-
-pytestmark = pytest.mark.usefixtures("compiled_in_haste")
-
 
 PRIORS = {
     "subsurface_fraction": dist.Beta(2.0, 2.0),
@@ -102,13 +99,7 @@ def everywhere(function: Callable, of: Case) -> Any:
 def reverse(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Value, gradient and Hessian as JAX finds them."""
     here = case(name)
-    potential = here.program.potential
-    around = lambda z, data: (  # noqa: E731
-        potential(z, data),
-        jax.grad(potential)(z, data),
-        jax.hessian(potential)(z, data),
-    )
-    return everywhere(around, here)
+    return everywhere(backwards(here.program.potential), here)
 
 
 def assert_close(ours: np.ndarray, theirs: np.ndarray) -> None:

@@ -18,17 +18,10 @@ from polar_bayes.methods import importance
 from polar_bayes.methods.method import AbstractMethod
 from polar_bayes.reporting.text import METHODS_USED
 
-pytestmark = pytest.mark.usefixtures("compiled_in_haste")
-
 
 @pytest.fixture(scope="module")
 def image() -> xr.Dataset:
     return plate_image(3, 4, seed=6)
-
-
-@pytest.fixture(scope="module")
-def weighted(image: xr.Dataset, compiled_in_haste: None) -> xr.Dataset:
-    return pb.fit_pixels(image, method="importance", **ASKED)
 
 
 class OneByOne(pb.methods.Importance):
@@ -37,23 +30,26 @@ class OneByOne(pb.methods.Importance):
     run_batch = AbstractMethod.run_batch
 
 
+def assert_as_on_a_grid(maps: xr.Dataset, image: xr.Dataset) -> None:
+    """Eight standard normals, in pairs: the largest is above 4.5 in one of ten thousand cases."""
+    assert (maps["status"] == Status.GOOD).all()
+    for y, x in np.ndindex(maps["status"].shape):
+        truth = on_a_grid(image["q"].values[y, x], NOISE, VIEWS)
+        for name in NAMES:
+            mean, sd, _ = truth[name]
+            error = sd / np.sqrt(maps["ess"].values[y, x])
+            assert abs(maps[name].values[y, x] - mean) < 4.5 * error
+
+
 @pytest.mark.thorough
 @each("kind", [OneByOne, pb.methods.Importance])
 def test_importance_sampling_makes_a_map(image: xr.Dataset, kind: type) -> None:
     method = kind(draws=1024)
     some = image.isel(y=[0, 1], x=[0, 1])
     maps = pb.fit_pixels(some, method=method, **ASKED)
-    assert (maps["status"] == Status.GOOD).all()
     assert (maps["method"] == MethodUsed.IMPORTANCE).all()
     assert (maps["pareto_k"] <= 0.7).all()
-    for y, x in np.ndindex(2, 2):
-        truth = on_a_grid(some["q"].values[y, x], NOISE, VIEWS)
-        for name in NAMES:
-            mean, sd, _ = truth[name]
-            error = sd / np.sqrt(maps["ess"].values[y, x])
-            # Eight standard normals, in pairs: the largest is above 4.5 in fewer than one of ten
-            # thousand cases.
-            assert abs(maps[name].values[y, x] - mean) < 4.5 * error
+    assert_as_on_a_grid(maps, some)
     # A pixel's answer does not depend on the others.
     alone = pb.fit_pixels(some.isel(y=[0], x=[0]), method=method, **ASKED)
     assert (alone[NAMES[0]].values == maps[NAMES[0]].values[:1, :1]).all()
@@ -63,11 +59,7 @@ def test_importance_sampling_makes_a_map(image: xr.Dataset, kind: type) -> None:
 def test_a_pixel_without_a_mode_is_searched_by_the_method_of_one_capture(image, monkeypatch):
     one = image.isel(y=[0], x=[0])
     monkeypatch.setattr(importance, "find_all_modes", lambda *_: (np.zeros(0, int), None))
-    maps = pb.fit_pixels(one, method=pb.methods.Importance(draws=1024), **ASKED)
-    assert (maps["status"] == Status.GOOD).all()
-    mean, sd, _ = on_a_grid(one["q"].values[0, 0], NOISE, VIEWS)[NAMES[0]]
-    error = sd / np.sqrt(float(maps["ess"][0, 0]))
-    assert abs(float(maps[NAMES[0]][0, 0]) - mean) < 4.5 * error
+    assert_as_on_a_grid(pb.fit_pixels(one, method=pb.methods.Importance(draws=1024), **ASKED), one)
 
 
 def test_modes_given_one_coordinate_are_found_around_a_bend(image: xr.Dataset) -> None:
@@ -103,7 +95,8 @@ def test_a_second_mode_that_another_start_finds_is_not_left_out(image: xr.Datase
 
 
 @pytest.mark.thorough
-def test_the_map_says_how_it_was_made(weighted: xr.Dataset, tmp_path: Path) -> None:
+def test_the_map_says_how_it_was_made(image: xr.Dataset, tmp_path: Path) -> None:
+    weighted = pb.fit_pixels(image, method="importance", **ASKED)
     assert json.loads(weighted.attrs[PROVENANCE])["method"] == "importance"
     page = pb.report(weighted, tmp_path / "report").read_text()
     assert "importance sampling from mixtures at all modes" in page

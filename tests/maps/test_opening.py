@@ -17,31 +17,24 @@ import polar_bayes as pb
 from polar_bayes.inference.batching import Status
 
 
-def test_what_was_written_is_read_when_it_is_needed(tmp_path: Path) -> None:
-    maps = make_maps({"roughness": np.full((4, 5), 0.3)})
-    maps.to_zarr(tmp_path / "map.zarr", consolidated=False)
-    found = pb.maps.open_map(tmp_path / "map.zarr")
-    assert not found.chunks
-    assert pb.maps.count_pixels(found)["good"] == 20
-    assert found.attrs == maps.attrs
-
-
 def test_what_is_no_whole_map_is_refused(tmp_path: Path) -> None:
-    store = tmp_path / "map.zarr"
-    with pytest.raises(pb.FitError, match="there is no such store"):
-        pb.maps.open_map(store)
-    store.mkdir()
-    with pytest.raises(pb.FitError, match="cannot be read as Zarr"):
-        pb.maps.open_map(store)
-    begun = tmp_path / "begun.zarr"
-    maps = make_maps({"roughness": np.ones((1, 1))}).assign_attrs(request_sha256="0")
-    maps.to_zarr(begun, consolidated=False)
-    with pytest.raises(pb.FitError, match="not finished; wait, or go on with"):
-        pb.maps.open_map(begun)
-    other = tmp_path / "other.zarr"
-    make_maps({"roughness": np.ones((1, 1))}).drop_vars("status").to_zarr(other, consolidated=False)
-    with pytest.raises(pb.FitError, match="it holds no maps"):
-        pb.maps.open_map(other)
+    store, maps = tmp_path / "map.zarr", make_maps({"roughness": np.ones((1, 1))})
+    (tmp_path / "empty.zarr").mkdir()
+    maps.assign_attrs(request_sha256="0").to_zarr(tmp_path / "begun.zarr", consolidated=False)
+    maps.drop_vars("status").to_zarr(tmp_path / "other.zarr", consolidated=False)
+    for name, what in (
+        ("map", "there is no such store"),
+        ("empty", "cannot be read as Zarr"),
+        ("begun", "not finished; wait, or go on with"),
+        ("other", "it holds no maps"),
+    ):
+        with pytest.raises(pb.FitError, match=what):
+            pb.maps.open_map(tmp_path / f"{name}.zarr")
+    maps.to_zarr(store, consolidated=False)
+    found = pb.maps.open_map(store)
+    assert not found.chunks
+    assert pb.maps.count_pixels(found)["good"] == 1
+    assert found.attrs == maps.attrs
 
 
 def test_a_capture_may_be_a_zarr_store_or_a_file(tmp_path: Path) -> None:

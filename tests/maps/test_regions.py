@@ -19,7 +19,6 @@ from polar_bayes.inference.batching import Status
 
 SIDE, NOISE, SPREAD, ZERO = 16, 0.05, 0.1, 0.07
 PRIORS = {"dark_level": dist.Normal(0.0, 0.3)}
-pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 
 
 def above_zero(data, scene, priors, links) -> None:
@@ -46,7 +45,7 @@ def image() -> xr.Dataset:
 
 
 @pytest.fixture(scope="module")
-def maps(image: xr.Dataset, compiled_in_haste: None) -> xr.Dataset:
+def maps(image: xr.Dataset) -> xr.Dataset:
     asked = ASKED | {"model": above_zero, "priors": PRIORS}
     return pb.fit_pixels(image, shared="dark_level", **asked)
 
@@ -123,18 +122,27 @@ def test_regions_of_a_store_and_pixels_without_an_answer(maps: xr.Dataset, tmp_p
     assert (whole["pixels"].item(), whole["unanswered"].item()) == (7 * SIDE, SIDE)
 
 
-@pytest.mark.parametrize(
-    ("labels", "against", "what"),
-    [
+def test_labels_that_do_not_fit_are_refused(maps, image, tmp_path):
+    for labels, against, what in (
         (np.ones((SIDE, 3), int), None, "they are int64 of shape"),
         (np.ones((SIDE, SIDE)), None, "they are float64"),
         (np.zeros((SIDE, SIDE), bool), None, "no pixel is in a region"),
         (np.ones((SIDE, SIDE), int), 7, "no region has the label 7; give one of 1"),
-    ],
-)
-def test_labels_that_do_not_fit_are_refused(maps, labels, against, what):
-    with pytest.raises(pb.FitError, match=what):
-        pb.maps.region_means(maps, labels, against=against)
+    ):
+        with pytest.raises(pb.FitError, match=what):
+            pb.maps.region_means(maps, labels, against=against)
+    with pytest.raises(pb.FitError, match="it holds no maps"):
+        pb.maps.region_means(image, np.ones((SIDE, SIDE), bool))
+    picture, array = tmp_path / "labels.tiff", tmp_path / "labels.npy"
+    for file, make, what in (
+        (picture, lambda: Image.new("RGB", (4, 3)).save(picture), "not gray values"),
+        (picture, lambda: Image.new("F", (4, 3)).save(picture), "and type float32"),
+        (picture, lambda: picture.write_text("no picture"), "cannot be read"),
+        (array, lambda: np.save(array, np.ones((3, 4))), "and type float64"),
+    ):
+        make()
+        with pytest.raises(pb.CaptureError, match=what):
+            pb.maps.load_labels(file)
 
 
 def test_the_command_reads_labels_from_a_picture(maps, tmp_path, capsys):
@@ -161,27 +169,6 @@ def test_a_parameter_of_several_values_has_a_row_for_each() -> None:
     assert table["pixels"].tolist() == [12, 12]
 
 
-NO_LABELS = {
-    "not gray values": lambda file: Image.new("RGB", (4, 3)).save(file),
-    "and type float32": lambda file: Image.new("F", (4, 3)).save(file),
-    "cannot be read": lambda file: file.write_text("no picture"),
-    "and type float64": lambda file: np.save(file, np.ones((3, 4))),
-}
-
-
-@pytest.mark.parametrize("what", NO_LABELS)
-def test_files_that_are_no_labels_are_refused(tmp_path: Path, what: str) -> None:
-    file = tmp_path / ("labels.npy" if "float64" in what else "labels.tiff")
-    NO_LABELS[what](file)
-    with pytest.raises(pb.CaptureError, match=what):
-        pb.maps.load_labels(file)
-
-
-def test_what_is_no_map_has_no_regions(image: xr.Dataset) -> None:
-    with pytest.raises(pb.FitError, match="it holds no maps"):
-        pb.maps.region_means(image, np.ones((SIDE, SIDE), bool))
-
-
 def test_pixels_that_say_nothing_are_told(maps: xr.Dataset) -> None:
     """Their mean is that of as many priors, and looks certain."""
     ignorant = maps.assign(level=0.0 * maps["level"], level_sd=0.0 * maps["level_sd"] + SPREAD)
@@ -192,9 +179,7 @@ def test_pixels_that_say_nothing_are_told(maps: xr.Dataset) -> None:
     (sentence,) = found.attrs["cautions"]
     assert "level of region True: its pixels are as wide as their priors, whose pull" in sentence
     assert np.isnan(found["level_prior_pull"].item())
-
-
-def test_without_a_known_prior_nothing_is_said_of_its_pull(maps: xr.Dataset) -> None:
+    # Without a known prior nothing is said of its pull.
     unknown = maps.copy()
     for key in ("prior_mean", "prior_sd"):
         del unknown["level"].attrs[key]

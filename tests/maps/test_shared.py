@@ -6,7 +6,7 @@ import xarray as xr
 from compilations import compilations
 from numpyro import handlers
 from plate_images import plate_image
-from plates import PLATE
+from plates import LINKS, ON_PLATE, PLATE
 
 import polar_bayes as pb
 from polar_bayes.inference.batching import Status
@@ -17,10 +17,8 @@ from polar_bayes.models.per_material import per_material
 SHARED = ("stokes_error_factor",)
 FACTOR = 1.6
 SIDE = 15
-LINKS = {"q": pb.links.StokesLink(stated_errors=True)}
 HALVES = np.where(np.arange(SIDE) < SIDE // 2, 0.8, 2.4) * np.ones((SIDE, 1))
 """The noise of the right half is three times that of the left one."""
-pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 
 
 def noisy(factor: float | np.ndarray, seed: int = 4) -> xr.Dataset:
@@ -36,8 +34,8 @@ def image() -> xr.Dataset:
 
 
 @pytest.fixture(scope="module")
-def maps(image: xr.Dataset, compiled_in_haste: None) -> xr.Dataset:
-    return pb.fit_pixels(image, scene=PLATE, links=LINKS, shared=SHARED)
+def maps(image: xr.Dataset) -> xr.Dataset:
+    return pb.fit_pixels(image, **ON_PLATE, shared=SHARED)
 
 
 def test_the_noise_of_an_image_is_one_number(image: xr.Dataset, maps: xr.Dataset) -> None:
@@ -50,9 +48,7 @@ def test_the_noise_of_an_image_is_one_number(image: xr.Dataset, maps: xr.Dataset
     assert row["pixels"] > 0.95 * SIDE**2
     assert row["disagreement"] < 3.1
     assert not pb.maps.shared_cautions(maps)
-
-
-def test_what_is_shared_has_no_map_and_pixels_keep_theirs(maps: xr.Dataset) -> None:
+    # What is shared has no map, and pixels keep theirs.
     assert not any(name.startswith("stokes_error_factor") for name in maps.data_vars)
     assert (maps["status"] == Status.GOOD).all()
 
@@ -60,7 +56,7 @@ def test_what_is_shared_has_no_map_and_pixels_keep_theirs(maps: xr.Dataset) -> N
 @pytest.mark.thorough
 def test_pixels_know_as_much_as_if_the_noise_were_given(image, maps):
     held = handlers.condition(per_material, data={"stokes_error_factor": FACTOR})
-    given = pb.fit_pixels(image, model=held, scene=PLATE, links=LINKS)
+    given = pb.fit_pixels(image, model=held, **ON_PLATE)
     for name in ("refractive_index", "subsurface_fraction"):
         ratio = maps[f"{name}_sd"] / given[f"{name}_sd"]
         # The scale differs from the truth by at most 3.5 of its sds of 2.4%.
@@ -68,21 +64,19 @@ def test_pixels_know_as_much_as_if_the_noise_were_given(image, maps):
 
 
 def test_pixels_that_disagree_are_told() -> None:
-    maps = pb.fit_pixels(noisy(HALVES), scene=PLATE, links=LINKS, shared=SHARED)
+    maps = pb.fit_pixels(noisy(HALVES), **ON_PLATE, shared=SHARED)
     (sentence,) = pb.maps.shared_cautions(maps)
     assert "stokes_error_factor is shared by all pixels, and they do not agree" in sentence
 
 
 @pytest.mark.thorough
 def test_it_does_not_matter_how_the_image_is_cut(image, maps, tmp_path):
-    image.chunk(y=4, x=8).to_zarr(tmp_path / "image.zarr", consolidated=False)
-    settings = {"scene": PLATE, "links": LINKS, "shared": SHARED}
-    stored = pb.maps.map_file(tmp_path / "image.zarr", tmp_path / "map.zarr", **settings)
+    paths = tmp_path / "image.zarr", tmp_path / "map.zarr"
+    image.chunk(y=4, x=8).to_zarr(paths[0], consolidated=False)
+    stored = pb.maps.map_file(*paths, **ON_PLATE, shared=SHARED)
     for name in maps.data_vars:
         np.testing.assert_array_equal(stored[name], maps[name], err_msg=str(name))
-    resumed = pb.maps.map_file(
-        tmp_path / "image.zarr", tmp_path / "map.zarr", resume=True, **settings
-    )
+    resumed = pb.maps.map_file(*paths, **ON_PLATE, shared=SHARED, resume=True)
     xr.testing.assert_identical(resumed.load(), stored.load())
     page = pb.report(stored, tmp_path / "report").read_text()
     assert "What all pixels have in common" in page
@@ -91,7 +85,7 @@ def test_it_does_not_matter_how_the_image_is_cut(image, maps, tmp_path):
 @pytest.mark.thorough
 def test_masked_pixels_say_nothing_about_what_is_shared(image: xr.Dataset) -> None:
     holes = image.assign(q=image["q"].where((image["y"] % 2 == 0) | (image["x"] % 3 > 0)))
-    maps = pb.fit_pixels(holes, scene=PLATE, links=LINKS, shared=SHARED)
+    maps = pb.fit_pixels(holes, **ON_PLATE, shared=SHARED)
     masked = int((maps["status"] == Status.MASKED).sum())
     assert masked == int(holes["q"].isnull().all("view").sum())
     found = pb.maps.shared_parameters(maps).loc["stokes_error_factor"]
@@ -108,7 +102,7 @@ def test_masked_pixels_say_nothing_about_what_is_shared(image: xr.Dataset) -> No
 )
 def test_what_cannot_be_shared_is_refused(image, columns: int, shared: object, what: str) -> None:
     with pytest.raises(pb.FitError, match=what):
-        pb.fit_pixels(image.isel(x=slice(columns)), scene=PLATE, links=LINKS, shared=shared)
+        pb.fit_pixels(image.isel(x=slice(columns)), **ON_PLATE, shared=shared)
 
 
 SETUP = pb.setups.Setup(PLATE, LINKS, priors=pb.setups.SETUPS["paper"].priors, shared=SHARED)

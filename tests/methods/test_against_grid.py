@@ -1,5 +1,6 @@
 """Samplers against a brute-force posterior, which knows neither modes nor gradients."""
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -8,8 +9,9 @@ import numpy as np
 import pytest
 import xarray as xr
 from arviz_stats.base import array_stats
+from cases import each
 from numpyro import distributions as dist
-from plates import LINKS, PLATE, plate_capture
+from plates import LINKS, ON_PLATE, PLATE, plate_capture
 
 import polar_bayes as pb
 from polar_bayes.inference.program import compile_program
@@ -53,21 +55,26 @@ class Grid(NamedTuple):
         return float(self.weights[self.values[name] <= value].sum())
 
 
-def grid_posterior(capture: xr.Dataset) -> Grid:
+@functools.cache
+def fitted(name: str) -> xr.DataTree:
+    """Long chains of a case."""
+    settings = pb.methods.Nuts(draws=2000, most_draws=4000, ess=2000.0)
+    return pb.fit(CASES[name], **ON_PLATE, method=settings, seed=1)
+
+
+@functools.cache
+def grid_posterior(case: str) -> Grid:
     """Evaluate the log density on a grid wide enough to hold all but 1e-8 of the mass."""
-    request = resolve(capture, "per_material", PLATE, None, LINKS, None, 0, "double")
+    request = resolve(CASES[case], "per_material", PLATE, None, LINKS, None, 0, "double")
     data = observe(request.capture)
     program = compile_program(request.bind(), data)
-    draws = pb.fit(capture, scene=PLATE, links=LINKS, method="nuts", seed=5)
-    posterior = draws["posterior"].dataset
+    posterior = fitted(case)["posterior"].dataset
     # Axes: the unconstrained coordinates in the program's order, around the sampled range,
     # widened by half on each side; the density at the border proves that nothing is cut off.
-    unconstrained = [
-        np.asarray(dist.biject_to(program.supports[name]).inv(posterior[name].to_numpy().ravel()))
-        for name in sorted(NAMES)
-    ]
     axes = []
-    for values in unconstrained:
+    for name in sorted(NAMES):
+        to_line = dist.biject_to(program.supports[name]).inv
+        values = np.asarray(to_line(posterior[name].to_numpy().ravel()))
         middle, reach = np.median(values), np.ptp(values)
         axes.append(np.linspace(middle - reach, middle + reach, POINTS))
     mesh = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
@@ -81,25 +88,15 @@ def grid_posterior(capture: xr.Dataset) -> Grid:
     for axis in range(len(axes)):
         border.swapaxes(0, axis)[[0, -1]] = True
     assert weights[border.ravel()].sum() < 1e-4
-    constrained = jax.vmap(program.constrain)(jnp.asarray(mesh))
+    constrained = jax.jit(jax.vmap(program.constrain))(jnp.asarray(mesh))
     return Grid({name: np.asarray(constrained[name]) for name in NAMES}, weights)
 
 
-@pytest.fixture(
-    scope="module",
-    params=[pytest.param("near normal", marks=pytest.mark.thorough), "far from normal"],
-)
-def case(request: pytest.FixtureRequest) -> tuple[str, xr.Dataset, Grid]:
-    capture = CASES[request.param]
-    return request.param, capture, grid_posterior(capture)
-
-
-def test_nuts_agrees_with_the_grid_everywhere(case: tuple[str, xr.Dataset, Grid]) -> None:
-    _, capture, grid = case
-    settings = pb.methods.Nuts(draws=2000, most_draws=4000, ess=2000.0)
-    result = pb.fit(capture, scene=PLATE, links=LINKS, method=settings, seed=1)
+@each("case", ["far from normal", "near normal"], quick=1)
+def test_nuts_agrees_with_the_grid_everywhere(case: str) -> None:
+    grid = grid_posterior(case)
     for name in NAMES:
-        draws = result["posterior"][name].to_numpy()
+        draws = fitted(case)["posterior"][name].to_numpy()
         # Four Monte Carlo standard errors: 6e-5 a comparison, 2e-3 over the 30 of this file.
         # The grid's own error, a trapezoid rule on a smooth density, is far below.
         error = array_stats.mcse(draws, method="mean")
@@ -118,9 +115,8 @@ def test_nuts_agrees_with_the_grid_everywhere(case: tuple[str, xr.Dataset, Grid]
 
 @pytest.mark.thorough
 def test_laplace_agrees_with_the_grid_where_the_posterior_is_near_normal() -> None:
-    capture = CASES["near normal"]
-    grid = grid_posterior(capture)
-    result = pb.fit(capture, scene=PLATE, links=LINKS, method="laplace", seed=1)
+    grid = grid_posterior("near normal")
+    result = pb.fit(CASES["near normal"], **ON_PLATE, method="laplace", seed=1)
     for name in ("refractive_index", "subsurface_fraction"):
         draws = result["posterior"][name].to_numpy()
         # Monte Carlo error of 2,000 independent draws is 0.02 sd; the rest is Laplace's own error.

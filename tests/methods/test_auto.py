@@ -1,7 +1,6 @@
 """The automatic choice: what it takes, why it climbs, and what it says of it."""
 
 import dataclasses
-import json
 import subprocess
 import sys
 import threading
@@ -18,32 +17,50 @@ from toy_models import VIEWS, capture, funnel, line, of_line, problem
 
 import polar_bayes as pb
 from polar_bayes.inference.problem import Problem
+from polar_bayes.inference.result import provenance_of
 from polar_bayes.methods.method import AbstractMethod, PosteriorDraws
 from polar_bayes.progress import no_progress
 from polar_bayes.scenes import fit_request as fitting
 
-LINKS, KEY = {"q": pb.links.StokesLink()}, jax.random.key(0)
+ASKED, KEY = {"model": line, "links": {"q": pb.links.StokesLink()}}, jax.random.key(0)
+DISCREPANCY = pb.instrument.Instrument((pb.instrument.Discrepancy(),))
+SYSTEMATIC = ASKED | {"scene": pb.Scene(pb.SmoothSurface(), instrument=DISCREPANCY)}
+"""A line, and one in a scene whose instrument is told apart by comparing."""
 
 
 @pytest.fixture(autouse=True)
-def few_prior_draws(compiled_in_haste: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def few_prior_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fitting, "PRIOR_DRAWS", 20)
 
 
 @dataclasses.dataclass(frozen=True)
 class Made(AbstractMethod):
-    """Independent draws of a normal posterior, with diagnostics as one likes."""
+    """Independent draws of a normal posterior, with diagnostics as one likes.
+
+    It takes some seconds and then says so, or is stuck for as long: reports nothing and does not
+    end, as if it compiled or ran compiled code. Another method may fit the comparisons.
+    """
 
     draws: int = 4000
     pareto_k: float = 0.1
     r_hat: float = np.nan
     problem: str = ""
     fails: str = ""
+    takes: float = 0.0
+    stuck: float = 0.0
+    other: AbstractMethod | None = None
+    seconds: float = np.inf
+    released: ClassVar[threading.Event] = threading.Event()
 
     @override
     def run(self, problem, key, progress) -> PosteriorDraws:
         if self.fails:
             raise pb.FitError(self.fails, where="Made", hint="nothing")
+        if self.stuck:
+            self.released.wait(self.stuck)
+        if self.takes:
+            time.sleep(self.takes)
+            progress("sampling", 0.5)
         z = np.random.default_rng(0).normal(size=(4, self.draws // 4, problem.program.size))
         return PosteriorDraws(
             "importance",
@@ -55,51 +72,22 @@ class Made(AbstractMethod):
             ess=float(self.draws),
         )
 
-
-@dataclasses.dataclass(frozen=True)
-class Reporting(Made):
-    """Takes half a second, and says so."""
-
-    @override
-    def run(self, problem, key, progress) -> PosteriorDraws:
-        time.sleep(0.5)
-        progress("sampling", 0.5)
-        return super().run(problem, key, progress)
-
-
-@dataclasses.dataclass(frozen=True)
-class Stuck(Made):
-    """Reports nothing and does not end, as if it compiled or ran compiled code."""
-
-    seconds: ClassVar[float] = 60.0
-    released: ClassVar[threading.Event] = threading.Event()
-
-    @override
-    def run(self, problem, key, progress) -> PosteriorDraws:
-        self.released.wait(self.seconds)
-        return super().run(problem, key, progress)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def whoever_is_stuck_is_let_go() -> Iterator[None]:
-    yield
-    Stuck.released.set()
-
-
-@dataclasses.dataclass(frozen=True)
-class Handing(Made):
-    """Has another method fit the comparisons."""
-
-    other: AbstractMethod = Made(draws=1000)
-    seconds: float = np.inf
-
     @override
     def deadline(self, problem) -> float:
         return time.perf_counter() + self.seconds
 
     @override
     def for_comparison(self, problem, draws) -> tuple[AbstractMethod, ...]:
-        return (self.other,)
+        return (self.other or self,)
+
+
+SLOW, STUCK = Made(takes=0.5), Made(stuck=60.0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def whoever_is_stuck_is_let_go() -> Iterator[None]:
+    yield
+    Made.released.set()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,8 +104,8 @@ class Given(pb.methods.Auto):
 def fitted(*rungs, tolerance=0.1, **settings):
     given = tuple((f"rung {number}", rung) for number, rung in enumerate(rungs))
     method = Given(given=given, tolerance=tolerance, **settings)
-    result = pb.fit(capture(), model=line, links=LINKS, method=method)
-    return result, json.loads(result.attrs["polar_bayes"])
+    result = pb.fit(capture(), **ASKED, method=method)
+    return result, provenance_of(result)
 
 
 def test_the_first_rung_that_is_good_enough_is_taken():
@@ -132,9 +120,7 @@ def test_the_first_rung_that_is_good_enough_is_taken():
 
 @pytest.mark.thorough
 def test_what_a_method_says_of_its_draws_stays_with_the_result():
-    said = json.loads(
-        pb.fit(capture(), model=line, links=LINKS, method=Made(pareto_k=2.0)).attrs["polar_bayes"]
-    )
+    said = provenance_of(pb.fit(capture(), **ASKED, method=Made(pareto_k=2.0)))
     assert (said["pareto_k"], said["ess"], said["r_hat"]) == (2.0, 4000.0, None)
 
 
@@ -218,21 +204,21 @@ def test_after_its_time_nothing_begins():
 def test_only_the_first_is_let_off_the_time_though_it_had_no_answer():
     """Chains that report progress after the time are stopped."""
     with pytest.raises(pb.FitError, match=r"rung 0: .*no peak.*rung 1: .*the time was up"):
-        fitted(Made(fails="no peak"), Reporting(), seconds=0.3)
+        fitted(Made(fails="no peak"), SLOW, seconds=0.3)
     # The first one always ends.
-    assert fitted(Reporting(), seconds=0.3)[1]["auto"]["met"]
+    assert fitted(SLOW, seconds=0.3)[1]["auto"]["met"]
 
 
 def test_what_is_stuck_is_abandoned_and_the_best_answer_so_far_is_returned():
     """Neither compilation nor compiled programs can be interrupted."""
-    rungs = (("rung 0", Made(pareto_k=0.9)), ("rung 1", Stuck()), ("rung 2", Made()))
+    rungs = (("rung 0", Made(pareto_k=0.9)), ("rung 1", STUCK), ("rung 2", Made()))
     here = problem(line)
     Given(given=rungs[:1]).run(here, KEY, no_progress)  # what judges draws is compiled
     begin = time.perf_counter()
     found = Given(given=rungs, tolerance=0.1, seconds=1.0).run(
         dataclasses.replace(here, start_time=begin), KEY, no_progress
     )
-    assert time.perf_counter() - begin < 0.5 * Stuck.seconds
+    assert time.perf_counter() - begin < 0.5 * STUCK.stuck
     said = found.metadata["auto"]
     assert [step["why"] for step in said["steps"]] == [
         "its Pareto k is 0.90",
@@ -272,7 +258,7 @@ def test_the_time_is_kept_on_a_busy_machine():
             process.kill()
             process.wait()
     took = time.perf_counter() - begin
-    first, *others = json.loads(result.attrs["polar_bayes"])["auto"]["steps"]
+    first, *others = provenance_of(result)["auto"]["steps"]
     assert "the time was up" in others[-1]["why"]
     assert took <= 1.2 * seconds + first["seconds"]
 
@@ -288,10 +274,7 @@ def test_comparisons_are_fitted_by_what_was_taken_and_in_the_time_that_is_left()
 
 def test_the_fit_beside_is_made_by_the_method_of_the_answer():
     """The instrument is told apart by comparing: never by choosing a method once more."""
-    scene = pb.Scene(
-        pb.SmoothSurface(), instrument=pb.instrument.Instrument((pb.instrument.Discrepancy(),))
-    )
-    result = pb.fit(capture(), model=line, links=LINKS, scene=scene, method=Handing())
+    result = pb.fit(capture(), **SYSTEMATIC, method=Made(other=Made(draws=1000)))
     assert result["posterior"].sizes["draw"] == 1000
     assert result["without_discrepancy"].sizes["draw"] == 250
     assert result["without_instrument"].sizes["draw"] == 250
@@ -299,18 +282,14 @@ def test_the_fit_beside_is_made_by_the_method_of_the_answer():
 
 @pytest.mark.thorough
 def test_comparisons_that_are_stuck_are_abandoned_and_told():
-    scene = pb.Scene(
-        pb.SmoothSurface(), instrument=pb.instrument.Instrument((pb.instrument.Discrepancy(),))
-    )
-    asked = {"model": line, "links": LINKS, "scene": scene}
-    late = pb.fit(capture(), method=Handing(seconds=-1.0), **asked)
-    said = json.loads(late.attrs["polar_bayes"])["comparisons_failed"]
+    late = pb.fit(capture(), method=Made(other=Made(draws=1000), seconds=-1.0), **SYSTEMATIC)
+    said = provenance_of(late)["comparisons_failed"]
     assert set(said.values()) == {"the time was up"}
     begin = time.perf_counter()
-    result = pb.fit(capture(), method=Handing(other=Stuck(), seconds=3.0), **asked)
-    assert time.perf_counter() - begin < 0.5 * Stuck.seconds
+    result = pb.fit(capture(), method=Made(other=STUCK, seconds=3.0), **SYSTEMATIC)
+    assert time.perf_counter() - begin < 0.5 * STUCK.stuck
     assert "without_discrepancy" not in result.children
-    said = json.loads(result.attrs["polar_bayes"])["comparisons_failed"]
+    said = provenance_of(result)["comparisons_failed"]
     assert said == dict.fromkeys(
         ("without_discrepancy", "without_instrument"), "abandoned when the time was up"
     )
@@ -329,8 +308,8 @@ def test_where_every_rung_fails_the_fit_is_refused():
 
 
 def test_a_normal_posterior_is_met_by_the_cheapest():
-    result = pb.fit(capture(), model=line, links=LINKS, method="auto", tolerance=0.2, seconds=600)
-    said = json.loads(result.attrs["polar_bayes"])["auto"]
+    result = pb.fit(capture(), **ASKED, method="auto", tolerance=0.2, seconds=600)
+    said = provenance_of(result)["auto"]
     assert (said["chosen"], said["met"], said["tolerance"]) == ("importance", True, 0.2)
     mean, covariance = of_line(capture()["q"].to_numpy())
     table = pb.summary(result).loc[["level", "slope"]]
@@ -345,8 +324,8 @@ def test_of_a_funnel_no_draws_are_taken_that_are_worse_than_they_say(seed):
     """At 0.1 sd weighted draws once were, which had lost the wide end (Pareto k .5, error .12)."""
     for tolerance in (0.5, 0.1):
         method = pb.methods.Auto(tolerance, 600.0)
-        result = pb.fit(capture(), model=funnel, links=LINKS, method=method, seed=seed)
-        said = json.loads(result.attrs["polar_bayes"])["auto"]
+        result = pb.fit(capture(), **ASKED | {"model": funnel}, method=method, seed=seed)
+        said = provenance_of(result)["auto"]
         error = abs(float(result["posterior"]["width"].mean())) / 3.0
         taken = [step["monte_carlo"] for step in said["steps"] if step["taken"]]
         assert all(error < expected < tolerance for expected in taken)
@@ -365,7 +344,7 @@ def test_of_a_funnel_no_draws_are_taken_that_are_worse_than_they_say(seed):
 )
 def test_what_cannot_be_asked_is_refused(asked, said):
     with pytest.raises(pb.FitError, match=said):
-        pb.fit(capture(), model=line, links=LINKS, **asked)
+        pb.fit(capture(), **ASKED, **asked)
 
 
 def test_each_of_several_methods_is_tried_once_more_with_more_draws() -> None:

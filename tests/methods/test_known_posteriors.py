@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 from cases import each
-from toy_models import capture, deep_funnel, funnel, line, of_line, problem, squared
+from toy_models import capture, deep_funnel, funnel, least_squares, line, of_line, problem, squared
 
 import polar_bayes as pb
 from polar_bayes.benchmark.run import labeled, sample_point
@@ -13,16 +13,6 @@ from polar_bayes.methods.auto import expected_error
 from polar_bayes.methods.importance import tail_shares
 from polar_bayes.numerics.mcse import draws_needed, quantile
 from polar_bayes.progress import no_progress
-
-SMALL = {
-    "point": pb.methods.Point(starts=2),
-    "laplace": pb.methods.Laplace(draws=1000),
-    "importance": pb.methods.Importance(),
-    "nuts": pb.methods.Nuts(ess=2000.0),
-}
-
-
-pytestmark = pytest.mark.usefixtures("compiled_in_haste")
 
 
 def test_a_problem_tells_what_is_estimated_and_from_what():
@@ -38,13 +28,6 @@ def run(method, problem, seed: int = 0):
     return method.run(problem, jax.random.split(jax.random.key(seed))[1], no_progress)
 
 
-def test_the_ladder_holds_every_method_that_is_tested_here():
-    assert set(pb.methods.STUDY_METHODS) == {*SMALL, "nuts short", "nuts long"}
-    assert {type(method) for method in pb.methods.STUDY_METHODS.values()} == {
-        type(m) for m in SMALL.values()
-    }
-
-
 @pytest.mark.thorough
 def test_gradients_of_a_warm_up_are_counted_as_they_were_made():
     here = problem(line)
@@ -57,20 +40,18 @@ def test_gradients_of_a_warm_up_are_counted_as_they_were_made():
 
 
 @pytest.mark.thorough
-def test_a_point_fit_has_the_width_of_its_standard_errors():
+def test_draws_about_a_point_fit_are_about_the_line_of_least_squares():
     here = problem(line)
-    found = sample_point(run(SMALL["point"], here), jax.random.key(1))
+    found = sample_point(run(pb.methods.Point(starts=2), here), jax.random.key(1))
     _, draws = labeled(here, found.z)
-    q = capture()["q"].to_numpy()
-    x = np.linspace(-1.0, 1.0, len(q))
-    slope, level = np.polyfit(x, q, 1)
-    np.testing.assert_allclose(draws.mean(axis=(1, 2)), [level, slope], atol=0.02)
+    expected = least_squares(capture()["q"].to_numpy())
+    np.testing.assert_allclose(draws.mean(axis=(1, 2)), expected, atol=0.02)
 
 
 @pytest.mark.thorough
 def test_both_modes_are_weighed_alike():
     here = problem(squared)
-    found = run(SMALL["importance"], here)
+    found = run(pb.methods.Importance(), here)
     assert not found.problems
     _, draws = labeled(here, found.z)
     share = float(np.mean(draws[-1] > 0.0))  # the root is the last in the alphabet
@@ -80,7 +61,7 @@ def test_both_modes_are_weighed_alike():
 @pytest.mark.thorough
 def test_chains_that_missed_a_mode_are_told():
     here = problem(squared)
-    both = run(SMALL["importance"], here)
+    both = run(pb.methods.Importance(), here)
     assert here.initialize().missed_mode_weight(both.z) == 0.0
     at = here.program.unravel(np.arange(here.program.size))["root"]
     one = both.z.copy()
@@ -95,7 +76,7 @@ def test_chains_that_missed_a_mode_are_told():
 
 def test_weighted_draws_find_what_chains_left_out():
     here = problem(squared)
-    both = here.constrain(run(SMALL["importance"], here).z)
+    both = here.constrain(run(pb.methods.Importance(), here).z)
     key = jax.random.key(5)
     told = tail_shares(here, both, key)["tails"]
     assert told["pareto_k"] < 0.7
@@ -149,11 +130,13 @@ def test_as_many_draws_are_needed_as_the_tolerance_says():
     assert quantile(1) == pytest.approx(2.5758, abs=1e-4)
     assert draws_needed(0.1, 3) == int(np.ceil((quantile(6) / 0.1) ** 2))
     assert draws_needed(0.05, 3) == pytest.approx(4 * draws_needed(0.1, 3), abs=4)
+    rungs = pb.methods.Auto(tolerance=0.1).candidates(problem(line))
+    assert rungs["importance"].draws == 16 * draws_needed(0.1, 2)
 
 
 def test_draws_that_are_no_numbers_have_an_infinite_error():
     here = problem(line)
-    found = run(SMALL["laplace"], here)
+    found = run(pb.methods.Laplace(draws=1000), here)
     found.z[0, 0, 0] = np.nan
     assert np.isposinf(expected_error(found, here))
 
@@ -165,14 +148,6 @@ def test_draws_are_scaled_and_settings_kept():
     assert (chains.draws, chains.most_draws, chains.ess) == (1000, 16000, 900.0)
     assert chains.warmup == 77
     assert pb.methods.Point().scale_draws(2.0) is None
-
-
-@pytest.mark.thorough
-def test_the_automatic_choice_asks_for_as_many_draws_as_it_needs():
-    auto, here = pb.methods.Auto(tolerance=0.1), problem(line)
-    needed = draws_needed(0.1, 2)
-    rungs = auto.candidates(here)
-    assert rungs["importance"].draws == 16 * needed
 
 
 @each(

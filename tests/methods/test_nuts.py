@@ -1,5 +1,6 @@
 """The loop around the NUTS kernel, on a normal distribution of known width."""
 
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -27,27 +28,28 @@ def density(z: jax.Array, center: jax.Array) -> jax.Array:
     return 0.5 * jnp.sum((z - center) ** 2)
 
 
-def target(size: int, chains: int) -> Target:
-    starts = np.random.default_rng(0).standard_normal((chains, size))
-    return Target(
+def sampled(settings: pb.methods.Nuts, seed: int, *, density=density, given=None, potential=None):
+    """Draws (chain, draw, 3), their statistics, whether goals were reached, and how often halved.
+
+    By default of a standard normal distribution.
+    """
+    here = Target(
         density=density,
-        given=jnp.zeros(size),
-        potential=lambda z: (0.5 * float(z @ z), z),
-        starts=starts,
-        metric=np.eye(size),
+        given=jnp.zeros(3) if given is None else given,
+        potential=potential or (lambda z: (0.5 * float(z @ z), z)),
+        starts=np.random.default_rng(0).standard_normal((settings.chains, 3)),
+        metric=np.eye(3),
     )
+    sampler = nuts.Sampler(OfFunction(density), settings.static(here))
+    return nuts.sample(sampler, here, jax.random.key(seed), settings)
 
 
 @pytest.mark.thorough
 def test_how_draws_are_cut_into_blocks_changes_nothing() -> None:
     """A warm-up that ends inside a block, too: its steps are counted, its draws are not kept."""
-    told = []
-    with jax.enable_x64(True):
-        for block in (60, 35):  # 60 divides the warm-up and the draws, 35 does neither
-            settings = pb.methods.Nuts(chains=2, warmup=60, draws=120, most_draws=120, block=block)
-            here = target(3, 2)
-            sampler = nuts.Sampler(OfFunction(density), settings.static(here))
-            told.append(nuts.sample(sampler, here, jax.random.key(1), settings))
+    settings = pb.methods.Nuts(chains=2, warmup=60, draws=120, most_draws=120)
+    with jax.enable_x64(True):  # 60 divides the warm-up and the draws, 35 does neither
+        told = [sampled(dataclasses.replace(settings, block=block), 1) for block in (60, 35)]
     (z, stats, *_), (again, others, *_) = told
     assert z.shape == (2, 120, 3)
     assert np.array_equal(z, again)
@@ -63,7 +65,9 @@ def test_chains_share_what_they_adapted() -> None:
         taken = []
         for width in (1.0, 10.0):
             widths = jnp.asarray([1.0, 1.0, width])
-            here = target(3, 3)._replace(
+            z, stats, *_ = sampled(
+                settings,
+                2,
                 density=lambda z, widths: 0.5 * jnp.sum((z / widths) ** 2),
                 given=widths,
                 potential=lambda z, widths=widths: (
@@ -71,8 +75,6 @@ def test_chains_share_what_they_adapted() -> None:
                     np.asarray(z / widths**2),
                 ),
             )
-            sampler = nuts.Sampler(OfFunction(here.density), settings.static(here))
-            z, stats, *_ = nuts.sample(sampler, here, jax.random.key(2), settings)
             assert len(np.unique(stats["step_size"])) == 1
             taken.append(stats["n_steps"].mean())
             # Four standard errors of a variance from 300 effective draws at least.
@@ -88,16 +90,14 @@ def funnel(z: jax.Array, scale: jax.Array) -> jax.Array:
 @pytest.mark.thorough
 def test_where_draws_diverge_it_changes_nothing_either() -> None:
     """Chains are redone after the same draws, whether a block holds one or all of them."""
-    told = []
+    settings = pb.methods.Nuts(chains=2, warmup=100, draws=100, most_draws=400, ess=1e6)
+    slope = jax.value_and_grad(lambda z: funnel(z, 3.0))
+    given = {"density": funnel, "given": jnp.asarray(3.0), "potential": slope}
     with jax.enable_x64(True):
-        for block in (20, 50, 100):
-            settings = pb.methods.Nuts(
-                chains=2, warmup=100, draws=100, most_draws=400, ess=1e6, block=block
-            )
-            here = target(3, 2)._replace(density=funnel, given=jnp.asarray(3.0))
-            here = here._replace(potential=jax.value_and_grad(lambda z: funnel(z, 3.0)))
-            sampler = nuts.Sampler(OfFunction(funnel), settings.static(here))
-            told.append(nuts.sample(sampler, here, jax.random.key(1), settings))
+        told = [
+            sampled(dataclasses.replace(settings, block=block), 1, **given)
+            for block in (20, 50, 100)
+        ]
     z, stats, reached, halvings = told[0]
     assert halvings > 0
     assert not reached

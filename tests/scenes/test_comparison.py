@@ -106,8 +106,13 @@ def test_weights_favor_the_better_and_share_between_equals() -> None:
     assert better[0] > 0.99
 
 
+def said_of(comparison: SceneComparison, **changes: Any) -> str:
+    """The sentences of a comparison with other entries."""
+    return " ".join(pb.scenes.scene_sentences(dataclasses.replace(comparison, **changes)))
+
+
 def test_sentences_name_the_scenes_and_why_others_went(comparison: SceneComparison) -> None:
-    said = " ".join(pb.scenes.scene_sentences(comparison))
+    said = said_of(comparison)
     assert "with body" in said
     assert "2 scenes were fitted" in said
     assert list(pb.scenes.scene_table(comparison)["weight"]) == list(comparison.table["weight"])
@@ -146,16 +151,12 @@ def test_a_prior_of_the_users_own_and_one_that_allows_the_index_stay(given) -> N
     assert not selection.lifted_prior(arguments.among([MIRROR]), MIRROR)
 
 
-def test_a_scene_that_may_have_escaped_a_bound_of_the_index_is_told(
-    comparison: SceneComparison,
-) -> None:
+def test_a_scene_that_may_have_escaped_a_bound_of_the_index_is_told(comparison) -> None:
     assert comparison.table["index_bound"].isna().all()
-    table = comparison.table.assign(index_bound=[np.nan, 2.0])
-    said = " ".join(pb.scenes.scene_sentences(dataclasses.replace(comparison, table=table)))
+    said = said_of(comparison, table=comparison.table.assign(index_bound=[np.nan, 2.0]))
     assert "The index of mirror lies against 2, where its prior ends" in said
     assert "priors={'refractive_index': TruncatedNormal(2, 0.3, low=1)}" in said
-    table = comparison.table.assign(index_bound=2.0)
-    said = " ".join(pb.scenes.scene_sentences(dataclasses.replace(comparison, table=table)))
+    said = said_of(comparison, table=comparison.table.assign(index_bound=2.0))
     assert "lies against" not in said  # the verdict has the bound of the scene that was chosen
 
 
@@ -195,53 +196,44 @@ BODY, ERRORS = "mirror + unpolarized body", "mirror + systematic errors"
 
 
 @each(
-    ("gain", "remaining", "undecided"),
+    ("gain", "remaining"),
     [
         # Told apart from none, and as good as the systematic errors that stood in for it.
-        (60.0, {"mirror + back face", f"{BODY} + back face"}, []),
+        (60.0, {"mirror + back face", f"{BODY} + back face"}),
         # Systematic errors are still better: it stands in for them.
-        (20.0, {"mirror", BODY, ERRORS, f"{BODY} + systematic errors"}, []),
+        (20.0, {"mirror", BODY, ERRORS, f"{BODY} + systematic errors"}),
         # It is not told apart from none.
-        (1.0, {"mirror", BODY, ERRORS, f"{BODY} + systematic errors"}, []),
+        (1.0, {"mirror", BODY, ERRORS, f"{BODY} + systematic errors"}),
     ],
 )
 def test_a_layer_remains_where_it_is_told_from_none_and_explains_what_errors_do(
-    monkeypatch: pytest.MonkeyPatch, gain: float, remaining: set[str], undecided: list[str]
+    monkeypatch: pytest.MonkeyPatch, plate: xr.Dataset, gain: float, remaining: set[str]
 ) -> None:
     gains = {"systematic errors": 50.0, "back face": gain, "water film": -30.0}
     without_fits(monkeypatch, gains)
-    plate = plate_capture(np.linspace(20.0, 75.0, 12), 0.01, seed=2)
     tried, allowed, listed = pb.compare_scenes(plate.assign_attrs(setup="goniometer"))
     assert {"mirror + back face", "mirror + water film"} <= set(tried)
     assert set(allowed) == remaining
-    assert listed == undecided
+    assert listed == []
 
 
-def test_a_film_that_is_as_good_as_none_is_said_and_does_not_remain(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_film_that_is_as_good_as_none_is_said_and_does_not_remain(monkeypatch, plate) -> None:
     without_fits(monkeypatch, {"water film": -1.0, "back face": -10.0, "systematic errors": -3.0})
-    plate = plate_capture(np.linspace(20.0, 75.0, 12), 0.01, seed=2)
     _, allowed, listed = pb.compare_scenes(plate.assign_attrs(setup="goniometer"))
     assert not any("film" in name for name in allowed)
     assert listed == ["mirror + water film"]
 
 
-def test_whose_index_it_is_is_said_where_a_film_is_not_decided(
-    comparison: SceneComparison,
-) -> None:
-    undecided = dataclasses.replace(comparison, undecided=("mirror",))
-    said = " ".join(pb.scenes.scene_sentences(undecided))
-    assert "The readings do not decide mirror." in said
-    table = comparison.table.rename(index={"mirror": "mirror + water film"})
-    film = dataclasses.replace(
+def test_whose_index_it_is_is_said_where_a_film_is_not_decided(comparison) -> None:
+    assert "The readings do not decide mirror." in said_of(comparison, undecided=("mirror",))
+    film = {"mirror": "mirror + water film"}
+    said = said_of(
         comparison,
-        table=table,
-        intervals=comparison.intervals.rename(index={"mirror": "mirror + water film"}),
+        table=comparison.table.rename(index=film),
+        intervals=comparison.intervals.rename(index=film),
         scenes={"mirror + water film": MIRROR, "with body": PLATE},
         undecided=("mirror + water film",),
     )
-    said = " ".join(pb.scenes.scene_sentences(film))
     assert "the index is that of the outermost interface, the film's where there is one" in said
 
 

@@ -20,16 +20,13 @@ MATERIAL = ("body", "slope")
 TINY = pb.methods.Laplace(chains=2, draws=50)
 
 
+LINEAR = {"scene": linear.SCENE, "links": linear.LINKS, "model": linear.model}
+
+
 def straight(q, **options):
     """A choice in the linear model, whose readings are these."""
     capture = plate_capture(np.linspace(20.0, 75.0, len(q)), 0.1, seed=0).assign(q=("view", q))
-    options = {
-        "scene": linear.SCENE,
-        "links": linear.LINKS,
-        "model": linear.model,
-        "parameters": MATERIAL,
-    } | options
-    return pb.choose_effects(capture, **options)
+    return pb.choose_effects(capture, **{**LINEAR, "parameters": MATERIAL, **options})
 
 
 @pytest.fixture(scope="module")
@@ -91,23 +88,16 @@ def test_two_that_are_light_alone_and_heavy_together_do_not_both_go(q: np.ndarra
     first, second = exact(q, "angle_zero"), exact(q, "dark_level")
     both = exact(q, "angle_zero", "dark_level")
     assert max(first, second) < 0.7 * both, "the readings do not pose the question"
-    tolerance = 0.5 * (max(first, second) + both)
-    choice = straight(q, tolerance=tolerance)
-    kept = choice.ledger["kept"]
+    ledger = straight(q, tolerance=0.5 * (max(first, second) + both)).ledger
     heavier = "AngleZero" if first > second else "DarkLevel"
-    assert kept.sel(effect=heavier)
-    assert kept.sel(effect=["AngleZero", "DarkLevel"]).sum() == 1
-    said = choice.ledger["reason"].sel(effect=heavier).item()
+    assert ledger["kept"].sel(effect=heavier)
+    assert ledger["kept"].sel(effect=["AngleZero", "DarkLevel"]).sum() == 1
+    said = ledger["reason"].sel(effect=heavier).item()
     assert said.startswith("without all other effects that may be dropped, ")
-    assert choice.ledger.attrs["combined_change"] == pytest.approx(min(first, second), rel=1e-3)
-
-
-@pytest.mark.thorough
-def test_a_looser_tolerance_drops_both(q: np.ndarray) -> None:
-    both = exact(q, "angle_zero", "dark_level")
-    choice = straight(q, tolerance=1.1 * both)
-    assert not choice.ledger["kept"].sel(effect=["AngleZero", "DarkLevel"]).any()
-    assert choice.ledger.attrs["combined_change"] == pytest.approx(both, rel=1e-3)
+    assert ledger.attrs["combined_change"] == pytest.approx(min(first, second), rel=1e-3)
+    looser = straight(q, tolerance=1.1 * both).ledger
+    assert not looser["kept"].sel(effect=["AngleZero", "DarkLevel"]).any()
+    assert looser.attrs["combined_change"] == pytest.approx(both, rel=1e-3)
 
 
 def test_what_the_user_keeps_stays_and_what_the_user_drops_goes(q: np.ndarray) -> None:
@@ -133,12 +123,10 @@ def test_the_rule_asks_what_the_rest_changes_beside_what_the_user_drops(q: np.nd
 
 
 def test_a_parameter_that_the_user_names_is_not_given_up(q: np.ndarray) -> None:
-    choice = straight(q, parameters=["dark_level"], tolerance=1e6)
-    assert choice.ledger["kept"].to_numpy().tolist() == [False, True, False]
-    assert (
-        "no judged parameter is left without it"
-        in choice.ledger["reason"].sel(effect="DarkLevel").item()
-    )
+    ledger = straight(q, parameters=["dark_level"], tolerance=1e6).ledger
+    assert ledger["kept"].to_numpy().tolist() == [False, True, False]
+    reason = ledger["reason"].sel(effect="DarkLevel").item()
+    assert "no judged parameter is left without it" in reason
 
 
 @each(
@@ -169,19 +157,13 @@ def test_a_scene_without_effects_is_returned_as_it_is(plate: xr.Dataset) -> None
 
 
 @pytest.mark.thorough
-def test_the_ledger_belongs_to_its_scene_alone(
-    chosen: pb.scenes.ChosenScene, full: pb.Scene
-) -> None:
+def test_the_ledger_belongs_to_its_scene_alone_and_can_be_saved(chosen, full, tmp_path) -> None:
     assert dataclasses.replace(chosen, coat=pb.ClearCoat()).ledger is None
     assert full.ledger is None
     assert repr(chosen).startswith("Scene(")
     again = pickle.loads(pickle.dumps(chosen))
     assert again.ledger.identical(chosen.ledger)
     assert again == chosen
-
-
-@pytest.mark.thorough
-def test_the_ledger_can_be_saved(chosen: pb.scenes.ChosenScene, tmp_path) -> None:
     chosen.ledger.to_netcdf(tmp_path / "ledger.nc")
     with xr.open_dataset(tmp_path / "ledger.nc") as opened:
         assert opened.load().identical(chosen.ledger)

@@ -1,18 +1,10 @@
 """Which parts a capture allows, and how candidates grow."""
 
-import numpy as np
-import pytest
 import xarray as xr
-from plates import plate_capture
 
 import polar_bayes as pb
 from polar_bayes.physics.instrument import AngleZero, ChannelGain, Discrepancy
 from polar_bayes.scenes.library import default_links, scene_library
-
-
-@pytest.fixture
-def plate() -> xr.Dataset:
-    return plate_capture(np.linspace(20.0, 75.0, 12), 0.01, seed=2)
 
 
 def off_mirror(capture: xr.Dataset) -> xr.Dataset:

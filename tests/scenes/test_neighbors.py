@@ -51,13 +51,8 @@ def _exact(q: np.ndarray, slope: float) -> tuple[float, float, float]:
 
 @pytest.fixture(scope="module")
 def fitted_line() -> xr.DataTree:
-    return pb.fit(
-        toy_models.capture(),
-        model=_line,
-        scene=ROUGH,
-        links=linear.LINKS,
-        method=pb.methods.Laplace(draws=DRAWS),
-    )
+    asked = {"scene": ROUGH, "links": linear.LINKS, "method": pb.methods.Laplace(draws=DRAWS)}
+    return pb.fit(toy_models.capture(), model=_line, **asked)
 
 
 def test_bayes_factor_and_answer_are_those_in_closed_form(fitted_line) -> None:
@@ -81,23 +76,14 @@ def test_the_same_is_read_back_from_a_file(fitted_line, tmp_path) -> None:
     assert again.equals(alternatives(fitted_line))
 
 
-def test_a_scene_without_alternatives_has_an_empty_table() -> None:
-    smooth = pb.Scene(pb.SmoothSurface())
-    fit = pb.fit(
-        toy_models.capture(),
-        model=toy_models.line,
-        scene=smooth,
-        links=linear.LINKS,
-        method="laplace",
-    )
+def test_a_scene_without_alternatives_has_an_empty_table_and_a_point_fit_none() -> None:
+    asked = {"model": toy_models.line, "scene": pb.Scene(pb.SmoothSurface()), "links": linear.LINKS}
+    fit = pb.fit(toy_models.capture(), method="laplace", **asked)
     assert alternatives(fit).empty
     assert criticize(fit).loc["alternatives", "level"] == "passed"
-
-
-def test_a_point_fit_has_nothing_to_compare() -> None:
-    fit = pb.fit(toy_models.capture(), model=toy_models.line, links=linear.LINKS, method="point")
+    point = pb.fit(toy_models.capture(), method="point", **asked)
     with pytest.raises(FitError, match=r"not compared.*by a method that gives draws"):
-        alternatives(fit)
+        alternatives(point)
 
 
 def _fit(preset: str, setup: str, seed: int = 0, parameters=None, **parts) -> xr.DataTree:
