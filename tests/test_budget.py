@@ -27,7 +27,7 @@ CODE = {
     "scenes": 1764,
     "own files": 1561,
     "models": 320,
-    "tests": 23699,
+    "tests": 22580,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
