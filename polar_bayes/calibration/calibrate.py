@@ -70,9 +70,10 @@ def calibrate(
         simulations: How many, at least 20.
         model: As for `polar_bayes.fit`; scene, priors, links and largest_view_zenith too.
         method: As for `polar_bayes.fit`, by default the one that it takes: a name is one algorithm,
-            so what is tested here is what a fit does. "nuts" runs chains for each simulation, which
-            takes seconds each; "importance" fits many side by side. Or the settings of a method of
-            `pb.methods`, such as those of a map; least squares make no draws.
+            so what is tested here is what a fit does. "auto" fits many side by side by importance
+            sampling, and the others by chains; "nuts" runs chains for each simulation, which takes
+            seconds each. Or the settings of a method of `pb.methods`, such as those of a map; least
+            squares make no draws.
         scene: A name, a `Scene` or None.
         priors: Overrides.
         links: One link, a mapping or None.
