@@ -184,7 +184,7 @@ def test_of_many_captures_those_that_the_cheapest_does_not_fit_are_left_to_the_n
     first, second = Made(draws=600, pareto_k=0.6), Made(draws=500)
     for rungs, draws in (((first, second), 500), ((second, first), 500), ((first,), 600)):
         method = Given(given=tuple((str(rung), rung) for rung in rungs))
-        maps = pb.fit_pixels(image, model=line, links=LINKS, method=method)
+        maps = pb.fit_pixels(image, **ASKED, method=method)
         assert (maps["ess"] == draws).all()
 
 
