@@ -19,7 +19,7 @@ CODE = {
     "importers": 2098,
     "inference": 2721,
     "maps": 1705,
-    "methods": 1259,
+    "methods": 1263,
     "numerics": 996,
     "observation": 506,
     "physics": 2749,
@@ -27,12 +27,12 @@ CODE = {
     "scenes": 1764,
     "own files": 1561,
     "models": 320,
-    "tests": 22580,
+    "tests": 22642,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25507,
+    "code": 25511,
     "classes": 332,
     "constants": 417,
     "Any": 177,

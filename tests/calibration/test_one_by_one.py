@@ -24,6 +24,7 @@ from polar_bayes.inference.program import BLOCK
 from polar_bayes.inference.request import resolve
 from polar_bayes.methods.method import AbstractMethod, PosteriorDraws, thin_draws
 from polar_bayes.observation.data import observe
+from polar_bayes.progress import no_progress
 
 COUNT, PATCHES, VIEWS, NOISE = 80, 3, 4, 0.5
 SHORT = pb.methods.Nuts(chains=2, warmup=50, draws=50, most_draws=50, block=50)
@@ -144,11 +145,30 @@ def test_weighted_draws_of_a_discrepancy_are_made_one_after_another_in_double_pr
     assert np.mean(found["fits"]["status"] == Status.GOOD) > 0.5
 
 
-@pytest.mark.thorough
-def test_chains_of_any_length_have_their_parameters(capture: xr.Dataset) -> None:
+def problem_of(capture: xr.Dataset) -> Problem:
     request = resolve(capture, population, PLATE, None, LINKS, None, 0, "double")
     data = observe(request.capture)
-    here = Problem(compile_model(request, data), data, jax.random.key(1))
+    return Problem(compile_model(request, data), data, jax.random.key(1))
+
+
+@pytest.mark.thorough
+def test_a_fit_is_that_of_the_public_verb(capture: xr.Dataset) -> None:
+    """The same posterior: mean and spread against the closed form."""
+    settings, here = pb.methods.Laplace(draws=4000, chains=1), problem_of(capture)
+    parameters = here.constrain(settings.run(here, jax.random.key(2), no_progress).z)
+    q = np.asarray(here.data.readings["q"])
+    # Patch means are normal around the location with the variance of a patch and of its mean.
+    spread = 1.0 + NOISE**2 / VIEWS
+    precision = 0.25 + PATCHES / spread
+    mean, sd = q.mean(axis=1).sum() / spread / precision, precision**-0.5
+    draws = parameters["location"]
+    assert abs(draws.mean() - mean) < 4.0 * sd / np.sqrt(draws.size)
+    assert draws.std() == pytest.approx(sd, rel=4.0 / np.sqrt(2.0 * draws.size))
+
+
+@pytest.mark.thorough
+def test_chains_of_any_length_have_their_parameters(capture: xr.Dataset) -> None:
+    here = problem_of(capture)
     z = np.random.default_rng(1).normal(size=(2, BLOCK + 3, here.program.size))
     found = here.constrain(z)
     assert found["level"].shape[:2] == z.shape[:2]

@@ -1,19 +1,24 @@
-"""Every link goes through the same checks; one of a user's own runs in docs/extending.md."""
+"""Every link goes through the same checks; one of a user's own takes one class in one file."""
 
 import dataclasses
 import functools
+from typing import ClassVar, override
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import each
+from numpyro import distributions as dist
+from numpyro.infer.util import log_density
 from synthetic_observations import make_observations
 
 from polar_bayes.design.fisher import information
 from polar_bayes.errors import FitError
 from polar_bayes.maps.residuals import standardize
+from polar_bayes.models.per_material import per_material
 from polar_bayes.observation import links
+from polar_bayes.observation.data import observe
 from polar_bayes.observation.links import (
     AbstractLink,
     BetaLink,
@@ -23,8 +28,12 @@ from polar_bayes.observation.links import (
     StudentTLink,
     noise_parameters,
 )
-from polar_bayes.priors import PRIORS, RANGES
-from polar_bayes.simulation import NOISE
+from polar_bayes.physics.mixing import StokesMixing
+from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.subsurface import Unpolarized
+from polar_bayes.physics.surface import SmoothSurface
+from polar_bayes.priors import PRIORS, RANGES, resolve_priors
+from polar_bayes.simulation import NOISE, Protocol, simulate
 
 LINKS = [
     ("dop", BetaLink()),
@@ -309,3 +318,47 @@ def test_a_contract_left_open_cannot_be_used():
 
     with pytest.raises(TypeError, match="abstract"):
         Unfinished()
+
+
+# --- a link of a user's own: this class is all that it takes --------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class LaplaceLink(AbstractLink):
+    """Noise with an absolute-value penalty: sharp at the prediction, forgiving far from it."""
+
+    observables: ClassVar[tuple[str, ...]] = ("q", "u")
+    parameters: ClassVar[tuple[str, ...]] = ("laplace_scale",)
+
+    @override
+    def distribution(self, name, prediction, data, noise):
+        return dist.Laplace(prediction[name], noise["laplace_scale"])
+
+
+@pytest.mark.thorough
+def test_a_link_of_a_users_own_simulates_and_fits_in_a_model():
+    links = {"q": LaplaceLink(), "u": LaplaceLink()}
+    scene = Scene(SmoothSurface(), Unpolarized(), StokesMixing())
+    protocol = Protocol(views=8, wavelengths=(450.0, 550.0))
+    noise = {"laplace_scale": 0.01}
+    capture = simulate("glass", scene=scene, links=links, protocol=protocol, noise=noise, seed=5)
+    data = observe(capture)
+    names = (*scene.parameters, *noise_parameters(links))
+    own = {"laplace_scale": dist.HalfNormal(0.05)}
+    arguments = (data, scene, resolve_priors(names, own), links)
+    with pytest.raises(FitError, match=r"laplace_scale.*no prior"):
+        resolve_priors(names)
+
+    def density(scale):
+        # On the axes of the plates: wavelength, then view, of length 1 where they do not repeat.
+        values = {
+            "subsurface_fraction": capture["true_subsurface_fraction"].values.reshape(1, 1),
+            "refractive_index": capture["true_refractive_index"].values.reshape(2, 1),
+            "laplace_scale": scale,
+        }
+        return log_density(per_material, arguments, {}, values)[0]
+
+    totals, slopes = jax.jit(jax.vmap(jax.value_and_grad(density)))(jnp.array([0.001, 0.01, 0.1]))
+    assert np.all(np.isfinite(slopes))
+    # 32 readings drawn with a scale of 0.01 tell it from one ten times off by 30 and more.
+    assert totals[1] > max(totals[0], totals[2]) + 10.0

@@ -1,6 +1,7 @@
 """The automatic choice: what it takes, why it climbs, and what it says of it."""
 
 import dataclasses
+import json
 import subprocess
 import sys
 import threading
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 from cases import each
 from plates import at_mirror, plate_capture
-from toy_models import VIEWS, capture, funnel, line, of_line, problem
+from toy_models import VIEWS, capture, deep_funnel, funnel, line, of_line, problem
 
 import polar_bayes as pb
 from polar_bayes.inference.problem import Problem
@@ -120,7 +121,8 @@ def test_the_first_rung_that_is_good_enough_is_taken():
 
 @pytest.mark.thorough
 def test_what_a_method_says_of_its_draws_stays_with_the_result():
-    said = provenance_of(pb.fit(capture(), **ASKED, method=Made(pareto_k=2.0)))
+    result = pb.fit(capture(), **ASKED, method=Made(pareto_k=2.0))
+    said = json.loads(result.attrs["polar_bayes"])  # with what is null
     assert (said["pareto_k"], said["ess"], said["r_hat"]) == (2.0, 4000.0, None)
 
 
@@ -316,6 +318,15 @@ def test_a_normal_posterior_is_met_by_the_cheapest():
     sd = np.sqrt(np.diagonal(covariance))
     assert (np.abs(table["mean"] - mean) / sd < 0.2).all()
     assert (np.abs(table["sd"] / sd - 1.0) < 0.2).all()
+
+
+@pytest.mark.thorough
+def test_by_default_a_deep_funnel_is_left_to_chains_and_no_answer_is_trusted():
+    result = pb.fit(capture(), **ASKED | {"model": deep_funnel})
+    first, second = provenance_of(result)["auto"]["steps"]
+    assert "Pareto k" in first["why"]
+    assert "R-hat" in second["why"]
+    assert not pb.verdict(result).converged
 
 
 @pytest.mark.thorough

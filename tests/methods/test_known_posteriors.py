@@ -24,6 +24,13 @@ def test_a_problem_tells_what_is_estimated_and_from_what():
     assert table.attrs == {"used": {"q": 6}, "measured": {"q": 6}}
 
 
+def test_a_study_compares_every_method_that_is_tested_here():
+    methods = pb.methods.STUDY_METHODS
+    assert set(methods) == {"point", "laplace", "importance", "nuts", "nuts short", "nuts long"}
+    tested = (pb.methods.Point, pb.methods.Laplace, pb.methods.Importance, pb.methods.Nuts)
+    assert {type(method) for method in methods.values()} == set(tested)
+
+
 def run(method, problem, seed: int = 0):
     return method.run(problem, jax.random.split(jax.random.key(seed))[1], no_progress)
 

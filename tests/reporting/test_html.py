@@ -15,7 +15,7 @@ import polar_bayes as pb
 from polar_bayes.diagnostics import convergence, criticism
 from polar_bayes.diagnostics.checked import checks_made
 from polar_bayes.diagnostics.compare import compare_without
-from polar_bayes.diagnostics.convergence import Verdict, verdict
+from polar_bayes.diagnostics.convergence import Verdict, summary, verdict
 from polar_bayes.diagnostics.criticism import criticize
 from polar_bayes.diagnostics.view import FitView, view_of
 from polar_bayes.errors import PolarBayesError
@@ -30,6 +30,12 @@ pytestmark = pytest.mark.usefixtures("unpainted")
 @pytest.fixture(scope="module")
 def small() -> xr.DataTree:
     return make_result(**SMALL)
+
+
+def test_every_number_of_the_table_is_the_tree_s(small: xr.DataTree) -> None:
+    text, row = Page(render(small)).text, summary(small).loc["refractive_index"]
+    for column in ("mean", "sd", "q2.5", "q97.5"):
+        assert numbers([row[column]], row["sd"])[0] in text
 
 
 @pytest.mark.thorough

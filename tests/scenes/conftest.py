@@ -11,7 +11,9 @@ PLATE = pb.Scene(
     surface=pb.SmoothSurface(),
     subsurface=pb.Unpolarized(),
     mixing=pb.StokesMixing(),
-    instrument=pb.instrument.Instrument((pb.instrument.BeamOverlap(), pb.instrument.Leakage())),
+    instrument=pb.instrument.Instrument(
+        (pb.instrument.AngleZero(), pb.instrument.BeamOverlap(), pb.instrument.Leakage())
+    ),
 )
 
 
