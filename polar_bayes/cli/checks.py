@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 @model_option
 @option(
     "--method", type=MANY_METHOD, default=FIT_DEFAULT,
-    help=f"{', '.join(MANY_METHOD.names)}; importance and laplace fit many captures side by side.",
+    help=f"{', '.join(MANY_METHOD.names)}; all but nuts fit many captures side by side.",
 )  # fmt: skip
 @option("--simulations", type=int, default=1000)
 @scene_options

@@ -83,6 +83,11 @@ class Auto(AbstractMethod):
         if self.seconds is not None and not self.seconds > 0.0:
             self.refuse(f"seconds is {self.seconds}", "give a time above 0, such as 60")
 
+    @property
+    def largest_pareto_k(self) -> float:
+        """Of weights that are taken; without a tolerance their variance must be finite."""
+        return FINITE_VARIANCE if self.tolerance is None else MAX_PARETO_K
+
     def candidates(self, problem: Problem) -> dict[str, AbstractMethod]:
         """Return the methods to try for a capture, each with the draws it needs.
 
@@ -180,7 +185,7 @@ class Auto(AbstractMethod):
             taken: list[int] = []
             for found in method.run_batch(batch):
                 good = np.asarray(found.status) == Status.GOOD
-                good &= ~(np.asarray(found.pareto_k) > FINITE_VARIANCE)
+                good &= ~(np.asarray(found.pareto_k) > self.largest_pareto_k)
                 good &= np.asarray(found.ess) >= SMALLEST_ESS
                 taken.extend(found.at[np.broadcast_to(good, found.at.shape)])
                 yield found
@@ -190,13 +195,12 @@ class Auto(AbstractMethod):
 
     def _judge(self, name: str, draws: PosteriorDraws, problem: Problem, begin: float) -> "Attempt":
         error = expected_error(draws, problem)
-        doubts = bias_doubts(draws, problem)
-        if self.tolerance is None and draws.pareto_k > FINITE_VARIANCE and not doubts:
-            doubts.append(f"its Pareto k is {draws.pareto_k:.2f}")
+        doubts = bias_doubts(draws, problem, self.largest_pareto_k)
         biased = bool(doubts)
-        if self.tolerance is None and not draws.ess >= SMALLEST_ESS:
-            doubts.append(f"its effective sample size is {draws.ess:.0f}")
-        if self.tolerance is not None and not error <= self.tolerance:
+        if self.tolerance is None:
+            if not draws.ess >= SMALLEST_ESS:
+                doubts.append(f"its effective sample size is {draws.ess:.0f}")
+        elif not error <= self.tolerance:
             doubts.append(f"its Monte Carlo error may be {error:.2g} posterior sd")
         return Attempt(
             name,
@@ -260,10 +264,12 @@ class Attempt(NamedTuple):
         return texts | {name: _rounded(getattr(self, name)) for name in numbers}
 
 
-def bias_doubts(draws: PosteriorDraws, problem: Problem) -> list[str]:
+def bias_doubts(
+    draws: PosteriorDraws, problem: Problem, largest_pareto_k: float = MAX_PARETO_K
+) -> list[str]:
     """Why draws may be biased."""
     doubts = draws.doubts
-    if draws.pareto_k > MAX_PARETO_K and not doubts:
+    if draws.pareto_k > largest_pareto_k and not doubts:
         doubts.append(f"its Pareto k is {draws.pareto_k:.2f}")
     if draws.r_hat > LARGEST_R_HAT:
         doubts.append(f"its R-hat is {draws.r_hat:.3f}")

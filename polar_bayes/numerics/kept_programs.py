@@ -55,8 +55,8 @@ class KeptProgram:
 
     def load(self) -> Compiled | None:
         """The program; None where it is damaged, or gone by now."""
+        _find_lapack()
         try:
-            _find_lapack()
             program, result = pickle.loads(self._path.read_bytes())
             return serialize_executable.deserialize_and_load(program, self._arguments, result)
         except FileNotFoundError:
