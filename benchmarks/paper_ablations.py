@@ -133,7 +133,8 @@ def pooling(study: Study) -> None:
         truth = np.clip(random.normal(1.5, SPREAD, PATCHES), 1.25, 1.95)
         capture = plates(truth, ERROR, seed=study.seed + repetition)
         for model, told in found.items():
-            result = pb.fit(capture, model=model, scene=PLATE, links=LINKS, seed=repetition)
+            asked = {"scene": PLATE, "links": LINKS, "method": "nuts", "seed": repetition}
+            result = pb.fit(capture, model=model, **asked)
             converged[model] += bool(pb.verdict(result).passed)
             draws = result["posterior"][INDEX].stack(all=("chain", "draw"))
             low, high = draws.quantile([0.025, 0.975], "all").to_numpy()

@@ -49,7 +49,8 @@ def replicates(label: str) -> None:
         truth = np.clip(rng.normal(1.5, spread, MEMBERS), 1.25, 1.95)
         capture = plates(truth, ERROR, seed=seed)
         for model in converged:
-            result = pb.fit(capture, model=model, scene=PLATE, links=LINKS, seed=seed)
+            asked = {"scene": PLATE, "links": LINKS, "method": "nuts", "seed": seed}
+            result = pb.fit(capture, model=model, **asked)
             converged[model] += pb.verdict(result).passed
             draws = result["posterior"]["refractive_index"].stack(all=("chain", "draw"))
             low, high = draws.quantile([0.025, 0.975], "all").to_numpy()

@@ -66,6 +66,7 @@ def commands(count: int) -> None:
         cache = CACHE | {"jax_compilation_cache_dir": path}
         quiet = os.environ | {name.upper(): str(value) for name, value in cache.items()}
         words = [sys.executable, "-m", "polar_bayes.cli", "fit", str(folder / "capture.nc")]
+        words += ["--method", "nuts"]
         print(f"{'command':<10}{'s':>7}{'of cores':>10}{'without chains':>16}")
         for seed in range(count + 1):
             before, start = _of_children(), time.perf_counter()
@@ -75,10 +76,11 @@ def commands(count: int) -> None:
             if not seed:
                 for name, value in cache.items():
                     jax.config.update(name, value)
-                pb.fit(capture)
+                pb.fit(capture, method="nuts")
                 print(f"{'cold':<10}{seconds:7.2f}{of_cores:10.2f}", flush=True)
                 continue
-            chains = provenance_of(pb.fit(capture, seed=seed))["timings"]["draws"]
+            found = pb.fit(capture, method="nuts", seed=seed)
+            chains = provenance_of(found)["timings"]["draws"]
             print(f"{seed:<10}{seconds:7.2f}{of_cores:10.2f}{seconds - chains:16.2f}", flush=True)
 
 

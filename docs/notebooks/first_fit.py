@@ -39,8 +39,8 @@ plt.show()
 # %% [markdown]
 # ## Three lines
 #
-# The default method, NUTS, draws from the posterior. Most of the time of a first fit is
-# compilation.
+# The default method draws from the posterior by importance sampling, and by NUTS where the weights
+# of such draws do not reach all of it. Most of the time of a first fit is compilation.
 
 # %%
 result = pb.fit(capture, scene=scene, seed=0)
@@ -49,10 +49,10 @@ pb.summary(result).round(3)
 
 # %% [markdown]
 # A row for each parameter: mean and standard deviation of the posterior, its 95% interval, and
-# diagnostics of the sampler. `r_hat` near 1 means that all chains found the same distribution; the
-# effective sample sizes are the numbers of independent draws with the same Monte Carlo error. The
-# last three rows are the noise and the exposure, which nobody knew and which are inferred with the
-# rest.
+# diagnostics of the draws. The effective sample sizes are the numbers of independent draws with the
+# same Monte Carlo error; `r_hat` near 1 means that all chains, or all parts of the weighted draws,
+# found the same distribution. The last three rows are the noise and the exposure, which nobody knew
+# and which are inferred with the rest.
 #
 # Before any number is quoted:
 

@@ -49,7 +49,7 @@ print(f"n = {row['mean']:.3f} [{row['q2.5']:.3f}, {row['q97.5']:.3f}]")
 print(*pb.verdict(first).sentences, sep="\n")
 
 # %% [markdown]
-# The chains may well have converged; the verdict still fails, because it judges the model, too.
+# The method may well have converged; the verdict still fails, because it judges the model, too.
 # Each sentence names a contradiction between readings and model and ends with a remedy.
 
 # %%
