@@ -21,10 +21,10 @@ CODE = {
     "maps": 1705,
     "methods": 1263,
     "numerics": 996,
-    "observation": 506,
+    "observation": 507,
     "physics": 2749,
     "reporting": 3271,
-    "scenes": 1764,
+    "scenes": 1768,
     "own files": 1561,
     "models": 320,
     "tests": 22642,
@@ -32,7 +32,7 @@ CODE = {
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25511,
+    "code": 25516,
     "classes": 332,
     "constants": 417,
     "Any": 177,

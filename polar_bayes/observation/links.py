@@ -20,6 +20,7 @@ from typing import ClassVar, override
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
@@ -44,6 +45,7 @@ __all__ = [
 ]
 
 PerView = Float[Array, "... view"]
+AnyPerView = PerView | Float[np.ndarray, "... view"]
 
 # --- Noise against brightness and view angle (the paper's section 2) ------------------------------
 
@@ -196,7 +198,7 @@ class AbstractLink(HTMLRepr, abc.ABC):
         """Return the noise-free reading, in the unit of the reading."""
         return prediction[name]
 
-    def reading(self, value: PerView) -> PerView:
+    def reading(self, value: AnyPerView) -> AnyPerView:
         """Return the reading in the form of the distribution; unchanged by default."""
         return value
 
@@ -214,9 +216,9 @@ class _DopLink(AbstractLink):
             raise FitError(f"margin is {self.margin}", where=type(self).__name__, hint=hint)
 
     @override
-    def reading(self, value: PerView) -> PerView:
+    def reading(self, value: AnyPerView) -> AnyPerView:
         # Readings of exactly 0 or 1 have density 0 or infinity; fits count how many there are.
-        return jnp.clip(value, self.margin, 1.0 - self.margin)
+        return value.clip(self.margin, 1.0 - self.margin)
 
     def _mean(self, prediction: Prediction) -> PerView:
         return jnp.clip(prediction["dop"], self.margin, 1.0 - self.margin)

@@ -203,9 +203,9 @@ def _provenance(request: Request, method: AbstractMethod, problem: Problem) -> P
     """Return everything that is needed to repeat the fit."""
     data = problem.data
     at_boundary = {
-        name: int(np.sum((np.asarray(link.reading(x)) != np.asarray(x)) & np.asarray(data.valid)))
+        name: int(np.sum((np.asarray(link.reading(x)) != x) & np.asarray(data.valid)))
         for name, link in request.links.items()
-        for x in [data.readings[name]]
+        for x in [np.asarray(data.readings[name])]
     }
     packages = ("polar_bayes", "jax", "numpyro", "arviz", "optimistix", "numpy", "xarray")
     used = {"used": int(np.sum(np.asarray(data.valid))), "at_margin": at_boundary}

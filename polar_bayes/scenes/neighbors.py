@@ -31,13 +31,14 @@ from numpyro import distributions as dist
 
 from polar_bayes.diagnostics.alternatives import NOTHING
 from polar_bayes.errors import FitError, SceneError
+from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.initialization import HEAVY_MODE, JointInit
 from polar_bayes.inference.problem import Problem, compile_request, make_problem
 from polar_bayes.inference.program import Values
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import Provenance, posterior_of
 from polar_bayes.methods.method import AbstractMethod
-from polar_bayes.numerics.compile import OutOfTimeError, run_until
+from polar_bayes.numerics.compile import JitOnce, OutOfTimeError, run_until
 from polar_bayes.numerics.mcse import SMALLEST_ESS
 from polar_bayes.numerics.optimize import (
     DifferencedPotential,
@@ -277,29 +278,36 @@ def _with_scene(
     covariance[np.ix_(here, here)] = symmetrize(modes.covariance[0])[np.ix_(there, there)]
     covariance[np.diag_indices_from(covariance)] *= 1.0 + 1e-9  # positive definite after rounding
     potential = DifferencedPotential(program.evaluated, data, np.sqrt(np.diagonal(covariance)))
-    # What only the other scene has starts at the median of its prior.
     own = [name for name in program.positions if name not in known]
+    if not own:
+        return potential, starts, covariance
+    # What only the other scene has starts at the median of its prior.
     moved = own + [name for name in both if name in INDICES]
-    keys = dict(zip(moved, jax.random.split(key, len(moved)), strict=True))
-    drawn = {name: np.asarray(priors[name].sample(keys[name], (OTHER_STARTS,))) for name in moved}
-
-    def placed(start: np.ndarray, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        start = start.copy()
-        for name, value in values.items():
-            inverse = dist.biject_to(program.supports[name]).inv
-            start[..., program.positions[name]] = inverse(jnp.asarray(value))
-        return start
-
-    starts = placed(starts, {name: np.median(drawn[name], axis=0) for name in own})
+    draw = compiled_model.made(_prior_coordinates, tuple(moved))
+    medians, drawn = draw(jax.random.key_data(key))
+    for name in own:
+        starts[:, program.positions[name]] = medians[name]
     if len(own) > 1:  # fringes have many modes: the likeliest of some draws, the index with them
-        others = np.stack(
-            [
-                placed(starts[0], {name: each[number] for name, each in drawn.items()})
-                for number in range(OTHER_STARTS)
-            ]
-        )
+        others = np.repeat(starts[:1], OTHER_STARTS, axis=0)
+        for name in moved:
+            others[:, program.positions[name]] = drawn[name]
         starts = np.vstack([starts, others[by_likelihood(potential, others)[:OTHER_SEARCHES]]])
     return potential, starts, covariance
+
+
+def _prior_coordinates(compiled_model: CompiledModel, names: tuple[str, ...]) -> JitOnce:
+    """The program of prior draws of parameters, as coordinates of their medians and of each."""
+
+    def draw(key: Array) -> tuple[dict[str, Array], dict[str, Array]]:
+        keys = jax.random.split(jax.random.wrap_key_data(key), len(names))
+        medians, drawn = {}, {}
+        for name, own in zip(names, keys, strict=True):
+            inverse = dist.biject_to(compiled_model.program.supports[name]).inv
+            values = compiled_model.priors[name].sample(own, (OTHER_STARTS,))
+            medians[name], drawn[name] = inverse(jnp.median(values, axis=0)), inverse(values)
+        return medians, drawn
+
+    return JitOnce(draw)
 
 
 def _log_evidence(potential: ValueAndGradient, modes: Modes) -> float:
