@@ -62,7 +62,10 @@ print("problems:", verdict.problems)
 print("cautions:", verdict.cautions)
 
 # %% [markdown]
-# No problem and no caution is only half of the check. "Converged" means that the sampler worked,
+# There is no problem, but there is a caution: with a film of water on the plastic, another index
+# would explain these readings as well. Whoever knows that the plastic is dry may set it aside.
+#
+# A verdict without a problem is only half of the check. "Converged" means that the method worked,
 # not that the readings were informative. That is the next question: how much narrower is each
 # interval than it was before the data?
 
