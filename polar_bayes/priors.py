@@ -37,7 +37,7 @@ from numpyro.distributions import constraints, transforms
 from polar_bayes.errors import FitError
 from polar_bayes.expressions import parse_value
 from polar_bayes.physics.part import notation
-from polar_bayes.repr_html import DisplaySummary, Row, Table
+from polar_bayes.repr_html import DisplaySummary, Row, Table, value_text
 
 
 def support_bounds(prior: dist.Distribution) -> tuple[float, float]:
@@ -292,6 +292,7 @@ class NormalCoordinate(dist.TransformedDistribution):
 # --- Priors as text -------------------------------------------------------------------------------
 
 
+@value_text.register
 def describe_prior(prior: dist.Distribution) -> str:
     """A prior as text, for reports: `TruncatedNormal(loc=1.45, scale=0.15, low=1.2, high=2)`."""
     return prior_text(prior, is_exact=False)

@@ -205,4 +205,10 @@ def _cell(value: object) -> str:
         return "<br>".join(f"{_escaped(key)}: {_cell(item)}" for key, item in value.items())
     if isinstance(value, tuple) and value:
         return "<br>".join(map(_cell, value))
-    return _escaped(f"{value:g}" if isinstance(value, float) else value)
+    return _escaped(value_text(value))
+
+
+@functools.singledispatch
+def value_text(value: object) -> str:
+    """Return a value without members as text; who knows a kind of value registers its text."""
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -13,8 +13,8 @@ CODE = {
     "benchmark": 574,
     "calibration": 1035,
     "capture": 809,
-    "cli": 1260,
-    "design": 1087,
+    "cli": 1264,
+    "design": 1088,
     "diagnostics": 1792,
     "importers": 2098,
     "inference": 2721,
@@ -25,14 +25,14 @@ CODE = {
     "physics": 2749,
     "reporting": 3271,
     "scenes": 1768,
-    "own files": 1561,
+    "own files": 1565,
     "models": 320,
     "tests": 22642,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25516,
+    "code": 25525,
     "classes": 332,
     "constants": 417,
     "Any": 177,

@@ -71,7 +71,10 @@ def _save_import(capture: "Capture", out: Path) -> None:
 @link_option
 @name_option
 @option("--views", type=int, default=40)
-@option("--largest-view-zenith", type=float, default=85.0, help="Degrees.")
+@option(
+    "--largest-view-zenith", type=click.FloatRange(0.0, 90.0, min_open=True, max_open=True),
+    default=85.0, help="Degrees.",
+)  # fmt: skip
 @option(
     "--wavelength", "wavelengths", type=float, multiple=True, default=(450.0, 550.0, 650.0),
     help="Nanometers; give it once per wavelength.",

@@ -197,8 +197,9 @@ known_option = option(
     help="What an input quantity is known to, such as --known light_zenith=0.2; once for each.",
 )  # fmt: skip
 view_limit_option = option(
-    "--largest-view-zenith", type=float, help="Set aside views beyond it [degrees]."
-)
+    "--largest-view-zenith", type=click.FloatRange(0.0, 90.0, min_open=True),
+    help="Set aside views beyond it [degrees].",
+)  # fmt: skip
 
 
 def all_of(*options: Callable) -> Callable:

@@ -5,7 +5,6 @@ the posterior (Chaloner & Verdinelli 1995).
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -283,15 +282,17 @@ def _design(
         jacobian = jax.jacfwd(lambda z: parameter_vector(program, z, data))(z)
         return information_by_view(reading_information(program, z, data), axes), jacobian
 
+    def run(z: Array, center: Array, data: Observations) -> tuple[tuple, Array]:
+        of_draws = jax.lax.map(lambda one: evaluate(one, data), z)
+        return of_draws, prior_precision(program, center, data)
+
     # By what its trace depends on beside the model.
     name = f"information by {axes} of {views.measured} views, brightness {is_predicted}"
-    run = program.once(name, lambda z, data: jax.lax.map(lambda one: evaluate(one, data), z))
-    information, jacobian = jax.tree.map(np.asarray, run(z, data))
-    precision = program.once("prior precision", functools.partial(prior_precision, program))
-    hessian = precision(center, data)
+    found = program.once(name, run)(z, center, data)
+    (information, jacobian), hessian = jax.tree.map(np.asarray, found)
     size, many = program.size, data.shape[-1]
     by_view = {n: x.reshape(count, -1, many, size, size) for n, x in information.items()}
-    base = positive_definite(np.asarray(hessian), extended.prior) + sum(
+    base = positive_definite(hessian, extended.prior) + sum(
         by_view[n][:, :, : views.measured].sum(axis=(1, 2)) for n in problem.program.observed
     )
     added = np.stack([by_view[name][:, :, views.measured :] for name in new], axis=1)

@@ -156,7 +156,7 @@ def resolve(
 def _check_settings(limit: float, precision: str, seed: int) -> None:
     what, hint = "", ""
     if not 0.0 < limit <= 90.0:
-        what, hint = f"largest_view_zenith is {limit}", "give degrees from 0 to 90"
+        what, hint = f"largest_view_zenith is {limit}", "give degrees above 0, up to 90"
     elif precision not in ("double", "single"):
         what, hint = f"precision is {precision!r}", "give 'double' or 'single'"
     elif not isinstance(seed, Integral) or isinstance(seed, bool) or not 0 <= seed < 2**32:
