@@ -15,7 +15,7 @@ CODE = {
     "capture": 809,
     "cli": 1264,
     "design": 1088,
-    "diagnostics": 1792,
+    "diagnostics": 1801,
     "importers": 2098,
     "inference": 2721,
     "maps": 1705,
@@ -27,12 +27,12 @@ CODE = {
     "scenes": 1768,
     "own files": 1565,
     "models": 320,
-    "tests": 22642,
+    "tests": 22649,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25525,
+    "code": 25534,
     "classes": 332,
     "constants": 417,
     "Any": 177,

@@ -14,6 +14,7 @@ import pandas as pd
 import xarray as xr
 from arviz_stats.base import array_stats
 
+from polar_bayes.diagnostics.approximation import approximation_cautions
 from polar_bayes.diagnostics.budget import budget_sentences
 from polar_bayes.diagnostics.checked import checks_made
 from polar_bayes.diagnostics.criticism import criticize
@@ -28,7 +29,7 @@ from polar_bayes.diagnostics.parameters import (
 from polar_bayes.diagnostics.view import FitView, Provenance, once, view_of
 from polar_bayes.inference.result import CENTRAL_95, bounds_of
 from polar_bayes.numerics.mcse import LARGEST_R_HAT, SMALLEST_ESS, TAILS
-from polar_bayes.numerics.psis import MAX_PARETO_K, smooth
+from polar_bayes.numerics.psis import MAX_PARETO_K
 from polar_bayes.priors import RANGES
 
 COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk", "ess_tail", "mcse_mean")
@@ -92,7 +93,7 @@ def verdict(fit: FitView) -> Verdict:
     problems += _weight_problems(fit)
     against = criticism["sentence"].groupby(criticism["level"], sort=False).agg(list)
     cautions = (
-        *_approximation_cautions(fit),
+        *approximation_cautions(fit),
         *_modes(provenance, drawn=False),
         *_tail_cautions(fit),
         *_estimate_cautions(fit),
@@ -158,27 +159,6 @@ def json_summary(result: xr.DataTree | FitView) -> dict[str, Any]:
         "method": fit.method,
         **{key: fit.provenance.get(key) for key in stated},
     }
-
-
-def laplace_pareto_k(result: xr.DataTree | FitView) -> float:
-    """Return Pareto k of the weights of Laplace draws, or of a variational guide's."""
-    return _smoothed_weights(result)[1]
-
-
-@once
-def _smoothed_weights(fit: FitView) -> tuple[np.ndarray, float]:
-    """Return smoothed weights of draws, and Pareto k; None and NaN without weights."""
-    # $$ w = p(z | data) / q(z) $$
-    # Source: Vehtari et al. (2024), JMLR 25(72).
-    if "log_weight" not in fit.stats:
-        return np.empty(0), math.nan
-    log_weight = fit.stats["log_weight"].to_numpy().astype(float).ravel()
-    if np.any(np.isnan(log_weight) | np.isposinf(log_weight)) or np.all(np.isneginf(log_weight)):
-        return np.empty(0), math.nan
-    if np.ptp(log_weight) < 1e-12:
-        return np.full(log_weight.size, 1.0 / log_weight.size), -math.inf
-    weights, pareto_k = smooth(log_weight[None])
-    return weights[0], float(pareto_k[0])
 
 
 def _draw_rows(found: Sequence[Scalar]) -> np.ndarray:
@@ -297,44 +277,6 @@ def _weight_problems(fit: FitView) -> Iterator[str]:
             f"The effective sample size of the weighted draws is {effective:.0f} (at least "
             f"{SMALLEST_ESS}): the interval is not known well enough, so draw more, as in "
             "Importance(draws=16384), or use method='nuts'."
-        )
-
-
-def _approximation_cautions(fit: FitView) -> Iterator[str]:
-    if fit.method not in APPROXIMATIONS or "log_weight" not in fit.stats:
-        return
-    weights, pareto_k = _smoothed_weights(fit)
-    if pareto_k <= MAX_PARETO_K:
-        yield from _corrections(weights, fit.scalars)
-    else:
-        draws, shape = ("the guide's draws", "the guide")
-        if fit.method == "laplace":
-            draws, shape = ("the Laplace draws", "a normal distribution")
-        yield (
-            f"Pareto k of {draws} is {pareto_k:.2f} (at most {MAX_PARETO_K}): the posterior is "
-            f"not close to {shape}; use method='nuts' for intervals."
-        )
-
-
-def _corrections(weights: np.ndarray, found: Sequence[Scalar]) -> Iterator[str]:
-    """List means and sds of an approximation that its smoothed weights change."""
-    changes = []
-    for scalar in found:
-        draws = scalar.draws.ravel()
-        if not np.isfinite(draws).all() or not np.ptp(draws) > 0.0:
-            continue
-        draws = draws / np.abs(draws).max()  # squares do not overflow; shift and ratio are the same
-        mean = weights @ draws
-        sd = math.sqrt(weights @ (draws - mean) ** 2)
-        shift, ratio = abs(mean - draws.mean()) / sd, draws.std() / sd
-        if shift > LIMITS.large_correction or abs(math.log(ratio)) > LIMITS.large_correction:
-            text = f"{scalar.label} (mean by {shift:.1f} sd, sd {ratio - 1.0:+.0%})"
-            changes.append((shift + abs(math.log(ratio)), text))
-    if changes:
-        names = listed(text for _, text in sorted(changes, reverse=True))
-        yield (
-            f"Importance weights correct the approximation: {names}; use "
-            "method='importance' or 'nuts' where that matters."
         )
 
 

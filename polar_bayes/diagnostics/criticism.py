@@ -21,6 +21,7 @@ from scipy.special import logsumexp
 
 from polar_bayes.capture.plausibility import ASSUMED, IndexByEye, index_sentences
 from polar_bayes.diagnostics.alternatives import NOTHING, alternatives
+from polar_bayes.diagnostics.approximation import smoothed_weights
 from polar_bayes.diagnostics.finding import Finding, join, judged_by, listed, p_text
 from polar_bayes.diagnostics.limits import LIMITS
 from polar_bayes.diagnostics.parameters import Scalar, with_entries
@@ -108,7 +109,7 @@ def criticize(result: xr.DataTree | FitView) -> pd.DataFrame:
             "bounds": _bounds(fit, is_beyond),
             "index": index,
             "systematic errors": _systematic_errors(fit, absent),
-            **residual_findings(residuals_of(fit)),
+            **residual_findings(residuals_of(fit), smoothed_weights(fit)[1]),
             "leave-one-out": _leave_one_out(predictive_checks(fit)),
             "repeats": _repeats(fit),
             "alternatives": _alternatives(fit, absent),

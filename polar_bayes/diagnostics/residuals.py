@@ -30,11 +30,13 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from polar_bayes.diagnostics.approximation import smoothed_weights
 from polar_bayes.diagnostics.finding import Finding, judged_by, listed, p_text
 from polar_bayes.diagnostics.limits import LIMITS
 from polar_bayes.diagnostics.predictive import FlatVariable, flat_variables
 from polar_bayes.diagnostics.view import FitView, once
 from polar_bayes.inference.checks import ANGLE_SCALES
+from polar_bayes.numerics.psis import MAX_PARETO_K
 from polar_bayes.observation.data import ANGLES
 from polar_bayes.physics.geometry import unit_vectors
 
@@ -67,6 +69,12 @@ def residuals_of(fit: FitView) -> Residuals | None:
         return None
     noise_free = np.concatenate([v.noise_free for v in variables], axis=1)
     noise = np.concatenate([v.predicted for v in variables], axis=1) - noise_free
+    rows, (weights, _) = np.arange(len(noise)), smoothed_weights(fit)
+    if weights.size == rows.size:
+        # Laplace's draws of a plate are too narrow in its noise and its discrepancy: systematic
+        # resampling, which leaves draws of equal weights as they are.
+        rows = np.searchsorted(np.cumsum(weights), (rows + 0.5) / rows.size)
+        noise, noise_free = noise[rows], noise_free[rows]
     observed = np.concatenate([v.observed for v in variables])
     readings = pd.concat([_readings(result, v) for v in variables], ignore_index=True)
     sd = noise.std(axis=0)
@@ -84,7 +92,7 @@ def residuals_of(fit: FitView) -> Residuals | None:
     share, axes = np.linalg.eigh(centered.T @ centered / (len(centered) - 1))
     root = (axes * np.sqrt(np.clip(1.0 - share, 0.0, None))) @ axes.T
     replicated = (noise[pick] @ root + centered[pick]) @ root
-    material = {s.label: s.draws.ravel() for s in fit.scalars if s.is_material}
+    material = {s.label: s.draws.ravel()[rows] for s in fit.scalars if s.is_material}
     material = {n: x for n, x in material.items() if np.isfinite(x).all() and np.ptp(x) > 0.0}
     scores = np.array([(x - x.mean()) / x.std() for x in material.values()]).reshape(
         len(material), len(centered)
@@ -136,16 +144,21 @@ def _readings(result: xr.DataTree, variable: FlatVariable) -> pd.DataFrame:
     return found
 
 
-def residual_findings(residuals: Residuals | None) -> dict[str, Finding]:
-    """Run the checks of residuals, and return them by name."""
+def residual_findings(residuals: Residuals | None, pareto_k: float) -> dict[str, Finding]:
+    """Run the checks of residuals, and return them by name; pareto_k of weights, or NaN."""
     checks = {
         "angle": _angle,
         "wavelength": _wavelength,
         "outliers": _outliers,
         "influence": _influence,
     }
-    if residuals is None:
+    is_coarse = pareto_k > MAX_PARETO_K
+    if is_coarse or residuals is None:
         sentence = "The fit holds too few predicted readings that lie within their range."
+        if is_coarse:
+            sentence = (
+                "The residuals were not judged, since the draws are too far from the posterior."
+            )
         missing = Finding("not computed", sentence=sentence)
         return dict.fromkeys(checks, missing)
     return {name: check(residuals) for name, check in checks.items()}

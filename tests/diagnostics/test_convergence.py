@@ -12,7 +12,8 @@ from synthetic_calibrations import make_calibration
 from synthetic_results import edit_provenance, make_result, replace
 
 import polar_bayes as pb
-from polar_bayes.diagnostics.convergence import json_summary, laplace_pareto_k, summary, verdict
+from polar_bayes.diagnostics.approximation import laplace_pareto_k
+from polar_bayes.diagnostics.convergence import json_summary, summary, verdict
 from polar_bayes.diagnostics.view import view_of
 
 
@@ -253,7 +254,8 @@ def test_k_hat_has_the_right_sign(width: float, trusted: bool) -> None:
 
 def test_a_guide_is_judged_by_its_weights_as_laplace_is() -> None:
     tree = weighted(log_weights(0.3))(make_result(**LAPLACE))
-    caution, lost = verdict(edit_provenance(tree, method="variational")).cautions
+    caution, unjudged, lost = verdict(edit_provenance(tree, method="variational")).cautions
+    assert "residuals were not judged" in unjudged
     assert "Leave-one-out cannot be approximated" in lost
     assert "Pareto k of the guide's draws is" in caution
     # Weights of draws that were chosen by weight are another matter.

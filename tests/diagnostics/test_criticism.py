@@ -1,6 +1,7 @@
 """Model criticism: calm when the model is right, and loud when the readings say that it is not."""
 
 import numpy as np
+import pytest
 import xarray as xr
 from cases import each
 from scipy import stats
@@ -69,6 +70,15 @@ def test_residuals_with_structure_are_told(check, change, layout, level, words) 
     row = criticize(_changed(change, **layout)).loc[check]
     assert row["level"] == level
     assert (f"p = {row['p_value']:.2g}" if words == "p = " else words) in row["sentence"]
+
+
+@pytest.mark.thorough
+@each("seed", [0, 2, 5])
+def test_an_approximation_of_a_right_plate_is_not_told_that_its_scene_lacks_something(seed) -> None:
+    """Laplace's discrepancy is half as wide as the posterior's, and k is above 0.7 for seed 5."""
+    views = pb.simulation.Protocol(views=30, wavelengths=())
+    plate = pb.simulate("glass", scene="goniometer", protocol=views, seed=seed)
+    assert pb.verdict(pb.fit(plate, method="laplace")).passed
 
 
 def test_readings_that_scatter_otherwise_are_not_uniform() -> None:
