@@ -79,7 +79,7 @@ def test_it_does_not_matter_how_the_image_is_cut(image, maps, tmp_path):
     resumed = pb.maps.map_file(*paths, **ON_PLATE, shared=SHARED, resume=True)
     xr.testing.assert_identical(resumed.load(), stored.load())
     page = pb.report(stored, tmp_path / "report").read_text()
-    assert "What all pixels have in common" in page
+    assert "Parameters that all pixels share" in page
 
 
 @pytest.mark.thorough

@@ -99,9 +99,13 @@ def test_weighted_draws_find_what_chains_left_out():
 
 @pytest.mark.thorough
 def test_weights_that_do_not_reach_all_of_a_posterior_are_a_problem():
-    found = run(pb.methods.Importance(draws=4096, rounds=1), problem(deep_funnel))
-    assert found.pareto_k > 0.7
-    assert any("Pareto k" in problem for problem in found.problems)
+    here, once = problem(deep_funnel), pb.methods.Importance(draws=4096, rounds=1)
+    found = [run(once, here, seed) for seed in range(6)]
+    # The estimate of k is random, too.
+    assert np.median([each.pareto_k for each in found]) > 0.7
+    for draws in found:
+        told = any("Pareto k" in problem for problem in draws.problems)
+        assert told == (draws.pareto_k > 0.7)
 
 
 @pytest.mark.thorough
