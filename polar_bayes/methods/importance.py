@@ -83,7 +83,7 @@ class Importance(AbstractMethod):
     """
 
     draws: int = 2048
-    rounds: int = 6
+    rounds: int = 12
 
     group_size: ClassVar[int] = AbstractBatchMethod.group_size
 
@@ -287,8 +287,10 @@ class Rounds:
         self._key, key = split_key(self._key)
         z = self.z
         weights = _temper(log_ratios, 10 * z.shape[1])  # effective draws that a fit needs
-        # One length compiles once: the draws of rounds to come have no weight.
-        missing = self._rounds * self._draws - len(z)
+        # Two lengths compile, that of half of the rounds and that of all: the draws of rounds to
+        # come have no weight.
+        half = -(-self._rounds // 2) * self._draws
+        missing = (half if len(z) <= half else self._rounds * self._draws) - len(z)
         z = np.pad(z, ((0, missing), (0, 0)))
         padded = np.pad(weights, (0, missing)).astype(z.dtype)
         return _fit_mixture(jnp.asarray(z), jnp.asarray(padded), 8, key)

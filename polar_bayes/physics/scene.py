@@ -238,8 +238,11 @@ class Scene(HTMLRepr):
 
     def _with_terms(self, terms: tuple[AbstractInstrumentTerm, ...]) -> "Scene":
         if terms == self.terms:
-            return self  # with what a scene carries besides its parts: how it was chosen
-        return dataclasses.replace(self, instrument=Instrument(terms) if terms else None)
+            return self
+        found = dataclasses.replace(self, instrument=Instrument(terms) if terms else None)
+        if self.ledger is not None:  # no effect is an input quantity, so it is true of both
+            object.__setattr__(found, "ledger", self.ledger)
+        return found
 
     def _optics(self, parameters: Parameters, geometry: Geometry) -> Light:
         """Return light in the stated frame of the viewer, for parameters with a view axis."""

@@ -58,9 +58,8 @@ from polar_bayes.scenes.library import (
 from polar_bayes.scenes.neighbors import suits_index
 from polar_bayes.scenes.sentences import SceneComparison, is_apart
 
-METHOD = Importance(draws=2048, rounds=12)
-"""Method of the fits that are compared. Most take few rounds; posteriors that are curved in many
-parameters take all, where chains would take minutes."""
+METHOD = Importance()
+"""Method of the fits that are compared."""
 
 MAX_FITS = 12
 """Largest number of candidates that forward selection fits."""
