@@ -19,20 +19,20 @@ CODE = {
     "importers": 2098,
     "inference": 2721,
     "maps": 1705,
-    "methods": 1263,
+    "methods": 1267,
     "numerics": 996,
     "observation": 507,
-    "physics": 2749,
+    "physics": 2752,
     "reporting": 3271,
-    "scenes": 1768,
+    "scenes": 1770,
     "own files": 1565,
     "models": 320,
-    "tests": 22649,
+    "tests": 22664,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25534,
+    "code": 25543,
     "classes": 332,
     "constants": 417,
     "Any": 177,

@@ -128,7 +128,7 @@ class Importance(AbstractMethod):
             ess=effective,
             gradients=float(initialization.metadata["gradients"]),
             densities=float(len(z)),
-            metadata={"modes": initialization.metadata},
+            metadata={"modes": initialization.metadata, "rounds": len(sample.proposals)},
         )
 
     @override

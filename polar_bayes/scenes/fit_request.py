@@ -133,7 +133,7 @@ def choose_method(
             hint="leave it out, or give method='auto'",
         )
     if given:
-        return methods.Auto(**given)
+        return methods.Auto(tolerance, seconds)
     return find_method(method, "fit", one=True)
 
 

@@ -62,7 +62,7 @@ def fit_best_scenes(
                 or (
                     isinstance(method, Auto)
                     and method.tolerance is None
-                    and _serves_as_chains(comparison.fits[name])
+                    and _serves_as_chains(comparison.fits[name], method.rounds)
                 )
             )
             else fit_request(
@@ -101,10 +101,12 @@ def _add_provenance(result: xr.DataTree, **more: object) -> None:
     result.attrs[PROVENANCE] = json.dumps(provenance, sort_keys=True)
 
 
-def _serves_as_chains(weighted: xr.DataTree) -> bool:
-    """Return whether weighted draws converged, with weights of finite variance."""
-    pareto_k = provenance_of(weighted).get("pareto_k")
-    return pareto_k is not None and pareto_k <= FINITE_VARIANCE and verdict(weighted).converged
+def _serves_as_chains(weighted: xr.DataTree, rounds: int) -> bool:
+    """Return whether weighted draws converged in so many rounds, with a finite variance."""
+    known = provenance_of(weighted)
+    if known.get("pareto_k") is None or known.get("rounds", 1) > rounds:
+        return False
+    return known["pareto_k"] <= FINITE_VARIANCE and verdict(weighted).converged
 
 
 def stack_fits(fits: Mapping[str, xr.DataTree], weights: Mapping[str, float]) -> xr.DataTree:

@@ -304,6 +304,14 @@ def test_tolerances_that_weighted_draws_cannot_meet_are_left_to_chains():
     assert list(pb.methods.Auto(tolerance=0.01).candidates(here)) == ["nuts"]
 
 
+def test_without_a_tolerance_weights_adapt_for_few_rounds():
+    here = problem(line)
+    found = pb.methods.Auto(rounds=2).candidates(here)["importance"]
+    assert found == pb.methods.Importance(rounds=2)
+    draws = found.run(here, jax.random.key(0), no_progress)
+    assert draws.metadata["rounds"] == 1  # of a normal posterior
+
+
 def test_where_every_rung_fails_the_fit_is_refused():
     with pytest.raises(pb.FitError, match=r"rung 0: .*no peak.*rung 1: .*no draws"):
         fitted(Made(fails="no peak"), Made(fails="no draws"))
