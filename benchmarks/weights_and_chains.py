@@ -3,7 +3,7 @@
     python benchmarks/weights_and_chains.py --setup camera --captures 24
 
 Truths are drawn from the priors of a set-up. Each capture is fitted by importance sampling, and by
-NUTS with 1,000 effective draws. Prints a row for each: rounds, Pareto k and effective draws of the
+NUTS. Prints a row for each: rounds, Pareto k and effective draws of the
 weights; the largest difference of the means and the smallest ratio of the standard deviations of
 the material, in those of the chains; the largest R-hat of the chains; and seconds of both, of which
 the first holds what is compiled.
@@ -21,7 +21,7 @@ from polar_bayes.inference.result import provenance_of
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS
 from polar_bayes.setups import SETUPS
 
-METHODS = pb.methods.Importance(), pb.methods.Nuts(ess=1000.0)
+METHODS = pb.methods.Importance(), pb.methods.Nuts()
 
 
 def main() -> None:

@@ -72,20 +72,21 @@ def inline(page: Path) -> list[str]:
 
 
 class Fits:
-    """Stands in for `polar_bayes.fit` on the pages; `instead` replaces what its first fit asks."""
+    """Stands in for `polar_bayes.fit` on the pages; `instead` replaces what a first fit asks."""
 
     def __init__(self, **instead: object) -> None:
         self.instead = {"method": TINY, **instead}
-        self.latest: xr.DataTree | None = None
+        self.latest: dict[object, xr.DataTree] = {}  # by set-up
 
     def __call__(self, capture: xr.Dataset, **asked: object) -> xr.DataTree:
+        setup = capture.attrs.get("setup")
         if "method" in asked and not isinstance(asked["method"], str):
-            self.latest = fit(capture, **asked)
-            return self.latest
+            self.latest[setup] = fit(capture, **asked)
+            return self.latest[setup]
         rehearse(capture, asked)
-        if self.latest is None:
-            self.latest = fit(capture, **asked | self.instead)
-        return self.latest
+        if setup not in self.latest:
+            self.latest[setup] = fit(capture, **asked | self.instead)
+        return self.latest[setup]
 
 
 def rehearse(capture: xr.Dataset, asked: dict[str, object]) -> None:

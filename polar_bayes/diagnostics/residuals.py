@@ -105,7 +105,7 @@ def residuals_of(fit: FitView) -> Residuals | None:
         left_out=np.maximum(replicated.var(axis=0), 1.0 - LIMITS.leverage),
         gains=scores @ centered / (len(centered) - 1),
         parameters=tuple(material),
-        directions=used[[*ANGLES]].to_numpy(),
+        directions=used[[*ANGLES]].to_numpy(float),
         wavelength=used["wavelength"].to_numpy(),
         group=pd.factorize(readings["group"])[0][keep],
         labels=tuple(used["label"]),

@@ -1,6 +1,7 @@
 """Every figure is a figure of its own, in the style that its reader has chosen."""
 
 import hashlib
+import importlib
 
 import matplotlib
 import matplotlib.style
@@ -73,6 +74,7 @@ def test_single_settings_are_taken_too() -> None:
 
 @pytest.mark.thorough
 def test_a_style_of_arviz_is_taken() -> None:
+    importlib.import_module("arviz_plots")  # which registers its styles
     with matplotlib.style.context("arviz-variat"):
         figure = DRAWN["plot_pairs"]()
         expected = to_hex(rcParams["figure.facecolor"])

@@ -151,8 +151,9 @@ def test_a_pixel_scatters_like_a_capture_of_its_truth():
         alone = simulate("glass", protocol=many, parameters=own, seed=2, **given)
         for name in ("dop", "intensity"):
             one, other = image[name][:, x].values, alone[name].values.reshape(COUNT, 5)
-            if name == "dop":  # nor do two pixels share their noise
-                assert all(np.unique(view).size == COUNT for view in one.T)
+            if name == "dop":  # nor do two pixels share their noise, unless they lie at a margin
+                inside = [view[(view > 1e-4) & (view < 1.0 - 1e-4)] for view in one.T]
+                assert all(np.unique(view).size == view.size > 0.9 * COUNT for view in inside)
             center = other.mean(axis=0)
             for power in (1, 2):  # where readings lie and how far they scatter
                 draws = [(sample - center) ** power for sample in (one, other)]
