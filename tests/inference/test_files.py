@@ -129,7 +129,7 @@ def test_a_damaged_result_is_refused_in_one_line_or_works(trees, functions, seed
 # Matplotlib says that an axis from 1e-300 to 1e300 overflows; the figure is drawn all the same.
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning:matplotlib")
 @pytest.mark.thorough
-@each("seed", (1, 5))
+@each("seed", range(8))
 def test_many_damaged_results_are_refused_in_one_line_or_work(tmp_path, seed):
     random = np.random.default_rng([14, seed])
     page = lambda tree: pb.report(tree, tmp_path / "report")  # noqa: E731
