@@ -29,7 +29,7 @@ from polar_bayes.diagnostics.parameters import (
 from polar_bayes.diagnostics.view import FitView, Provenance, once, view_of
 from polar_bayes.inference.result import CENTRAL_95, bounds_of
 from polar_bayes.numerics.mcse import LARGEST_R_HAT, SMALLEST_ESS, TAILS
-from polar_bayes.numerics.psis import MAX_PARETO_K
+from polar_bayes.numerics.psis import FEW_ROUNDS, MAX_PARETO_K
 from polar_bayes.priors import RANGES
 
 COLUMNS = ("mean", "sd", "q2.5", "q97.5", "r_hat", "ess_bulk", "ess_tail", "mcse_mean")
@@ -95,6 +95,7 @@ def verdict(fit: FitView) -> Verdict:
     cautions = (
         *approximation_cautions(fit),
         *_modes(provenance, drawn=False),
+        *_round_cautions(fit),
         *_tail_cautions(fit),
         *_estimate_cautions(fit),
         *_masked(provenance.get("counts", {})),
@@ -280,6 +281,17 @@ def _weight_problems(fit: FitView) -> Iterator[str]:
         )
 
 
+def _round_cautions(fit: FitView) -> Iterator[str]:
+    """Tell of weighted draws whose proposals were adapted for long."""
+    rounds = fit.provenance.get("rounds", 1)
+    if fit.method in WEIGHTED and rounds > FEW_ROUNDS:
+        yield (
+            f"The proposals of the weighted draws were adapted in {rounds} rounds (at most "
+            f"{FEW_ROUNDS}): they may miss the end of a long tail, of which Pareto k tells "
+            "nothing, so use method='nuts' where the ends of intervals matter."
+        )
+
+
 def _modes(provenance: Provenance, *, drawn: bool) -> Iterator[str]:
     """Another mode, of which weighted draws tell that the draws have their share, or not."""
     weights = (provenance.get("modes") or {}).get("weights", [])
@@ -320,7 +332,7 @@ def _tail_cautions(fit: FitView) -> Iterator[str]:
         yield (
             "The chains may have missed an arm of the posterior: where they have 2.5% of their "
             f"draws, weighted draws (Pareto k {tails['pareto_k']:.2f}) have more, {names}; "
-            "compare Importance(draws=2048, rounds=6), or sample longer."
+            "compare Importance(), or sample longer."
         )
 
 

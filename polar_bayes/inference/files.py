@@ -367,6 +367,7 @@ _FIT_PROVENANCE: Mapping[str, Spec] = {
     "modes?": {"weights?": [FINITE]},
     "pareto_k?": FINITE,
     "ess?": FINITE,
+    "rounds?": NUMBER,
     "auto?": {"tolerance?": FINITE, "met": FLAG, "chosen": TEXT, "steps": [_STEP]},
 }
 

@@ -247,8 +247,8 @@ def _choose_links(
             f"no polarization that these links describe (wanted {' or '.join(wanted)})",
             where=str(capture.attrs.get("name", "capture")),
             hint="links name every variable that is fitted: add BetaLink for dop, StokesLink for "
-            "q and u, or choose another scene; of a mirror the intensity alone will do, by "
-            "scene='goniometer'",
+            "q and u, or choose another scene, as scene='auto' does; of a mirror the intensity "
+            "alone will do, by scene='goniometer'",
         )
     return chosen
 

@@ -33,7 +33,12 @@ from polar_bayes.numerics.mcse import (
     draws_needed,
     largest_error,
 )
-from polar_bayes.numerics.psis import FINITE_VARIANCE, MAX_PARETO_K, max_effective_size
+from polar_bayes.numerics.psis import (
+    FEW_ROUNDS,
+    FINITE_VARIANCE,
+    MAX_PARETO_K,
+    max_effective_size,
+)
 from polar_bayes.progress import Progress
 
 MARGIN, MOST_TIMES = 1.5, 16.0
@@ -77,7 +82,7 @@ class Auto(AbstractMethod):
 
     tolerance: float | None = None
     seconds: float | None = None
-    rounds: int = 3
+    rounds: int = FEW_ROUNDS
 
     group_size: ClassVar[int] = AbstractBatchMethod.group_size
 

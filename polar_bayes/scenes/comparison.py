@@ -58,9 +58,6 @@ from polar_bayes.scenes.library import (
 from polar_bayes.scenes.neighbors import suits_index
 from polar_bayes.scenes.sentences import SceneComparison, is_apart
 
-METHOD = Importance()
-"""Method of the fits that are compared."""
-
 MAX_FITS = 12
 """Largest number of candidates that forward selection fits."""
 
@@ -298,7 +295,7 @@ def _fitted(name: str, requests: list[Request], stage: str, share: float, report
     def progress(*_: object) -> None:  # where a thread that was abandoned ends
         report(stage, share)
 
-    tree = fit_request(request, METHOD, progress, begun, with_comparisons=False)
+    tree = fit_request(request, Importance(), progress, begun, with_comparisons=False)
     view = view_of(tree)
     checks = predictive_checks(view)
     loo = [check.loo for check in checks.values() if check.loo is not None]
@@ -335,7 +332,7 @@ def _begin_to_compile(request: Request) -> None:
     """Trace the programs of a fit now, and compile them in another thread."""
     with contextlib.suppress(FitError):  # told when the fit is done
         problem = make_problem(request, jax.random.key(request.seed))
-        METHOD.prepare(problem)
+        Importance().prepare(problem)
         problem.prepare_predictions()
 
 

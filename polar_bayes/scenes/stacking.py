@@ -18,11 +18,12 @@ from polar_bayes.errors import FitError
 from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.methods.auto import Auto
+from polar_bayes.methods.importance import Importance
 from polar_bayes.methods.least_squares import Point
 from polar_bayes.methods.method import AbstractMethod
 from polar_bayes.numerics.psis import FINITE_VARIANCE
 from polar_bayes.progress import Progress
-from polar_bayes.scenes.comparison import METHOD, FitArguments, compare_candidates
+from polar_bayes.scenes.comparison import FitArguments, compare_candidates
 from polar_bayes.scenes.fit_request import Keep, fit_request
 from polar_bayes.scenes.neighbors import STOPPED, try_alternatives
 
@@ -58,7 +59,7 @@ def fit_best_scenes(
             name: comparison.fits[name]
             if as_compared
             and (
-                method == METHOD
+                method == Importance()
                 or (
                     isinstance(method, Auto)
                     and method.tolerance is None

@@ -262,6 +262,16 @@ def test_a_guide_is_judged_by_its_weights_as_laplace_is() -> None:
     assert not verdict(edit_provenance(tree, method="importance")).cautions
 
 
+def test_proposals_that_were_adapted_for_long_are_told() -> None:
+    few, many = (
+        verdict(edit_provenance(make_result(**LAPLACE), method="importance", rounds=rounds))
+        for rounds in (3, 4)
+    )
+    assert not few.cautions
+    (caution,) = many.cautions
+    assert "adapted in 4 rounds" in caution
+
+
 def test_a_point_fit_has_standard_errors_and_no_chains() -> None:
     table = summary(make_result(method="point"))
     assert np.isfinite(table["mean"]).all()
