@@ -27,7 +27,7 @@ CODE = {
     "scenes": 1769,
     "own files": 1565,
     "models": 320,
-    "tests": 22681,
+    "tests": 22689,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
