@@ -24,15 +24,15 @@ CODE = {
     "observation": 507,
     "physics": 2752,
     "reporting": 3271,
-    "scenes": 1769,
+    "scenes": 1771,
     "own files": 1565,
     "models": 320,
-    "tests": 22689,
+    "tests": 22696,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25553,
+    "code": 25555,
     "classes": 332,
     "constants": 417,
     "Any": 177,

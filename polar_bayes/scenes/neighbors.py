@@ -300,10 +300,12 @@ def _prior_coordinates(compiled_model: CompiledModel, names: tuple[str, ...]) ->
 
     def draw(key: Array) -> tuple[dict[str, Array], dict[str, Array]]:
         keys = jax.random.split(jax.random.wrap_key_data(key), len(names))
-        medians, drawn = {}, {}
+        program, medians, drawn = compiled_model.program, {}, {}
         for name, own in zip(names, keys, strict=True):
-            inverse = dist.biject_to(compiled_model.program.supports[name]).inv
-            values = compiled_model.priors[name].sample(own, (OTHER_STARTS,))
+            inverse = dist.biject_to(program.supports[name]).inv
+            prior, shape = compiled_model.priors[name], program.positions[name].shape
+            lead = shape[: len(shape) - len(prior.batch_shape)]  # each wavelength has its own
+            values = prior.sample(own, (OTHER_STARTS, *lead))
             medians[name], drawn[name] = inverse(jnp.median(values, axis=0)), inverse(values)
         return medians, drawn
 

@@ -75,7 +75,7 @@ def test_residuals_with_structure_are_told(check, change, layout, level, words) 
 
 @pytest.mark.thorough
 def test_residuals_of_a_few_mirror_views_are_flagged_as_seldom_as_is_stated() -> None:
-    """Of 60 right captures of six readings a caution (2%) comes in six or more once in 500."""
+    """Of 60 right captures of six readings a caution (2%) comes in six or more once in 800."""
     flagged = 0
     for seed in range(60):
         plate = plates([1.45 + 0.004 * seed], 0.03, seed=seed).isel(patch=0)

@@ -127,6 +127,16 @@ def test_a_film_of_water_that_hides_the_index_is_named() -> None:
     assert abs(n["other"] - truth) < 0.3 * abs(n["mean"] - truth)
 
 
+def test_a_plate_in_several_colors_is_compared_with_films_that_have_fringes() -> None:
+    """The index of each wavelength starts at draws of its prior, as the thickness does."""
+    views = Protocol(views=8, wavelengths=(450.0, 650.0))
+    plate = pb.simulate("glass", scene="goniometer", protocol=views, seed=1)
+    table = alternatives(pb.fit(plate, scene="goniometer", method="laplace"))
+    film = table[table["alternative"].str.contains("film")].loc[["refractive_index[450]"]]
+    assert np.isfinite(film[["log_bayes_factor", "shift"]]).all(axis=None)
+    assert len(film) == 2
+
+
 @pytest.fixture(scope="module")
 def absorbing_body() -> xr.DataTree:
     return _fit("leaf", "camera", subsurface=pb.physics.Depolarizer())
