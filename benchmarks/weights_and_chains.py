@@ -3,10 +3,10 @@
     python benchmarks/weights_and_chains.py --setup camera --captures 24
 
 Truths are drawn from the priors of a set-up. Each capture is fitted by importance sampling, and by
-NUTS. Prints a row for each: rounds, Pareto k and effective draws of the
-weights; the largest difference of the means and the smallest ratio of the standard deviations of
-the material, in those of the chains; the largest R-hat of the chains; and seconds of both, of which
-the first holds what is compiled.
+NUTS. Prints a row for each: rounds, Pareto k and effective draws of the weights; the largest
+difference of the means and the smallest ratio of the standard deviations of the material, in those
+of the chains; the largest R-hat of the chains; and seconds of both, of which the first holds what
+is compiled.
 """
 
 import argparse
