@@ -27,7 +27,7 @@ CODE = {
     "scenes": 1771,
     "own files": 1565,
     "models": 320,
-    "tests": 22702,
+    "tests": 22703,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
