@@ -15,7 +15,7 @@ CODE = {
     "capture": 809,
     "cli": 1264,
     "design": 1088,
-    "diagnostics": 1810,
+    "diagnostics": 1808,
     "importers": 2098,
     "inference": 2722,
     "maps": 1705,
@@ -27,12 +27,12 @@ CODE = {
     "scenes": 1771,
     "own files": 1565,
     "models": 320,
-    "tests": 22703,
+    "tests": 22707,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25555,
+    "code": 25553,
     "classes": 332,
     "constants": 417,
     "Any": 177,

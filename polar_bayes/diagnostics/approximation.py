@@ -7,18 +7,12 @@ import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-import xarray as xr
 
 from polar_bayes.diagnostics.finding import listed
 from polar_bayes.diagnostics.limits import LIMITS
 from polar_bayes.diagnostics.parameters import APPROXIMATIONS, Scalar
 from polar_bayes.diagnostics.view import FitView, once
 from polar_bayes.numerics.psis import MAX_PARETO_K, smooth
-
-
-def laplace_pareto_k(result: xr.DataTree | FitView) -> float:
-    """Return Pareto k of the weights of Laplace draws, or of a variational guide's."""
-    return smoothed_weights(result)[1]
 
 
 @once

@@ -228,19 +228,21 @@ class Scene(HTMLRepr):
         """
         own = {type(term) for term in self.terms}
         added = (each for each in quantities if type(each) not in own)
-        return self._with_terms((*self.terms, *added))
+        return self._with_quantities((*self.terms, *added))
 
     @property
     def perfectly_known(self) -> "Scene":
         """The scene without input quantities."""
         others = (x for x in self.terms if not isinstance(x, AbstractInputQuantity))
-        return self._with_terms(tuple(others))
+        return self._with_quantities(tuple(others))
 
     def _with_terms(self, terms: tuple[AbstractInstrumentTerm, ...]) -> "Scene":
-        if terms == self.terms:
-            return self
-        found = dataclasses.replace(self, instrument=Instrument(terms) if terms else None)
-        if self.ledger is not None:  # no effect is an input quantity, so it is true of both
+        return dataclasses.replace(self, instrument=Instrument(terms) if terms else None)
+
+    def _with_quantities(self, terms: tuple[AbstractInstrumentTerm, ...]) -> "Scene":
+        """The scene with other input quantities, which are no effects: its ledger stays true."""
+        found = self._with_terms(terms)
+        if self.ledger is not None:
             object.__setattr__(found, "ledger", self.ledger)
         return found
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from polar_bayes.benchmark.advice import accuracy_sentences, accuracy_view
 from polar_bayes.diagnostics import convergence
 from polar_bayes.diagnostics.alternatives import alternatives
-from polar_bayes.diagnostics.approximation import laplace_pareto_k
+from polar_bayes.diagnostics.approximation import smoothed_weights
 from polar_bayes.diagnostics.budget import (
     DISCREPANCY,
     budget,
@@ -561,7 +561,7 @@ def _sampler_facts(fit: FitView) -> dict[str, object]:
     facts = {title: tell(stats[name]) for name, (title, tell) in told.items() if name in stats}
     pareto_k = fit.provenance.get("pareto_k")
     if fit.method in APPROXIMATIONS and "log_weight" in stats:
-        pareto_k = laplace_pareto_k(fit)
+        _, pareto_k = smoothed_weights(fit)
     if pareto_k is not None:
         facts[f"Pareto k (at most {MAX_PARETO_K})"] = or_dash(pareto_k, ".2f")
     if (effective := fit.provenance.get("ess")) is not None:

@@ -159,6 +159,10 @@ def test_a_scene_without_effects_is_returned_as_it_is(plate: xr.Dataset) -> None
 @pytest.mark.thorough
 def test_the_ledger_belongs_to_its_scene_alone_and_can_be_saved(chosen, full, tmp_path) -> None:
     assert dataclasses.replace(chosen, coat=pb.ClearCoat()).ledger is None
+    known = chosen.known_to([pb.input_quantities.LightZenith()])
+    assert known.ledger is known.perfectly_known.ledger is chosen.ledger
+    for term in known.terms:
+        assert known.without(type(term)).ledger is None
     assert full.ledger is None
     assert repr(chosen).startswith("Scene(")
     again = pickle.loads(pickle.dumps(chosen))
