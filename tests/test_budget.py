@@ -13,7 +13,7 @@ CODE = {
     "benchmark": 574,
     "calibration": 1035,
     "capture": 809,
-    "cli": 1264,
+    "cli": 1270,
     "design": 1088,
     "diagnostics": 1808,
     "importers": 2098,
@@ -32,7 +32,7 @@ CODE = {
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25553,
+    "code": 25559,
     "classes": 332,
     "constants": 417,
     "Any": 177,

@@ -28,8 +28,8 @@ from polar_bayes.design.setup import provenance_attrs
 from polar_bayes.errors import FitError, PolarBayesError
 from polar_bayes.inference.problem import make_problem
 from polar_bayes.inference.request import Request, resolve
-from polar_bayes.methods.auto import STUDY_METHODS
 from polar_bayes.methods.method import AbstractMethod
+from polar_bayes.methods.study import STUDY_METHODS
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import Scene
 from polar_bayes.progress import Progress, no_progress, with_progress

@@ -12,6 +12,7 @@ soon as the cleanups of `polar_bayes.interrupts` are done.
 A compiled program is native code that the next run loads, so whoever can write it can run it.
 """
 
+import atexit
 import contextlib
 import contextvars
 import ctypes
@@ -191,7 +192,17 @@ BROKEN_PIPE = 141
 
 def console() -> NoReturn:
     """The program `polar-bayes`: run the arguments of this process as a command, and end it."""
-    end(main())
+    status: list[int] = []
+
+    def leave() -> None:
+        if status:  # else Python has an error to print
+            os._exit(status[0])
+
+    # What is registered before libraries are imported runs after theirs. Python would go on to free
+    # every object, for a second.
+    atexit.register(leave)
+    status.append(main())
+    end(status[0])
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -3,8 +3,7 @@
 import dataclasses
 import math
 import time
-from collections.abc import Iterator, Mapping
-from types import MappingProxyType
+from collections.abc import Iterator
 from typing import ClassVar, NamedTuple, override
 
 import numpy as np
@@ -21,11 +20,9 @@ from polar_bayes.methods.method import (
     AbstractMethod,
     PosteriorDraws,
     flatten,
-    make_method,
     problem_of,
 )
 from polar_bayes.methods.nuts import Nuts
-from polar_bayes.methods.registry import method_names
 from polar_bayes.numerics.compile import OutOfTimeError, run_until
 from polar_bayes.numerics.mcse import (
     LARGEST_R_HAT,
@@ -295,14 +292,3 @@ def bias_doubts(
 
 def _rounded(value: float) -> float | None:
     return round(float(value), 4) if np.isfinite(value) else None
-
-
-STUDY_METHODS: Mapping[str, AbstractMethod] = MappingProxyType(
-    {
-        **{name: make_method(name) for name in method_names(one=True) if name != "auto"},
-        "nuts short": Nuts(warmup=100, draws=100, most_draws=100),
-        "nuts long": Nuts(warmup=1000, draws=4000, most_draws=4000),
-    }
-)
-"""Methods that `polar_bayes.accuracy` compares by default. To add one, pass
-`{**STUDY_METHODS, "mine": Mine()}`."""

@@ -25,7 +25,7 @@ MADE_BY_SPHINX = {"genindex.html", "search.html", "py-modindex.html"}
 DEFINED_IN = {
     "priors.PRIORS": "PRIORS",
     "methods.registry.METHODS": "methods.METHODS",
-    "methods.auto.STUDY_METHODS": "methods.STUDY_METHODS",
+    "methods.study.STUDY_METHODS": "methods.STUDY_METHODS",
 }
 """Constants, whose documentation Sphinx finds only where they are defined."""
 
