@@ -15,11 +15,11 @@ CODE = {
     "capture": 809,
     "cli": 1270,
     "design": 1088,
-    "diagnostics": 1808,
+    "diagnostics": 1810,
     "importers": 2098,
     "inference": 2722,
     "maps": 1705,
-    "methods": 1267,
+    "methods": 1268,
     "numerics": 997,
     "observation": 507,
     "physics": 2752,
@@ -27,12 +27,12 @@ CODE = {
     "scenes": 1771,
     "own files": 1565,
     "models": 320,
-    "tests": 22707,
+    "tests": 22711,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25559,
+    "code": 25562,
     "classes": 332,
     "constants": 417,
     "Any": 177,

@@ -293,11 +293,14 @@ def _round_cautions(fit: FitView) -> Iterator[str]:
 
 
 def _modes(provenance: Provenance, *, drawn: bool) -> Iterator[str]:
-    """Another mode, of which weighted draws tell that the draws have their share, or not."""
-    weights = (provenance.get("modes") or {}).get("weights", [])
+    """Another mode, of which the draws are known to have their share, or not."""
+    modes = provenance.get("modes") or {}
+    weights = modes.get("weights", [])
     method = str(provenance.get("method", "laplace"))
     pareto_k = (provenance if method in WEIGHTED else provenance.get("tails") or {}).get("pareto_k")
-    is_drawn = pareto_k is not None and pareto_k <= MAX_PARETO_K
+    # Of chains that each visited all, R-hat tells whether they agree on the shares.
+    visited = modes.get("unvisited") == 0.0
+    is_drawn = visited or (pareto_k is not None and pareto_k <= MAX_PARETO_K)
     if len(weights) < 2 or weights[1] <= LIMITS.second_mode or drawn != is_drawn:
         return
     effect = "; "

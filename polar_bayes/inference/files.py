@@ -364,7 +364,7 @@ _FIT_PROVENANCE: Mapping[str, Spec] = {
     "alternatives?": [_ALTERNATIVE],
     "alternatives_failed?": TEXT,
     "standard_errors?": {EACH: [OPTIONAL]},
-    "modes?": {"weights?": [FINITE]},
+    "modes?": {"weights?": [FINITE], "unvisited?": FINITE},
     "pareto_k?": FINITE,
     "ess?": FINITE,
     "rounds?": NUMBER,

@@ -94,6 +94,7 @@ class Nuts(AbstractMethod):
         bulk, tail, r_hat = measure(np.moveaxis(z, -1, 0))
         warmup = np.sum(stats["warmup_steps"][:, 0])
         search = float(initialization.metadata.get("gradients", np.nan))
+        unvisited = initialization.missed_mode_weight(z)
         return PosteriorDraws(
             method="nuts",
             z=z,
@@ -103,7 +104,7 @@ class Nuts(AbstractMethod):
             gradients=search + float(warmup + np.sum(stats["n_steps"])),
             densities=0.0,
             metadata={
-                "modes": initialization.metadata,
+                "modes": {**initialization.metadata, "unvisited": unvisited},
                 "goals_reached": mixed,
                 "step_size_halvings": halvings,
             },

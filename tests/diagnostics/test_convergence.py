@@ -231,6 +231,10 @@ def test_another_mode_is_no_caution_where_weighted_draws_of_it_agree_with_the_ch
     assert "the draws are of both" in verdict(tree).findings[0]
     unknown = edit_provenance(tree, tails=tails | {"pareto_k": 0.9})
     assert "another mode, of weight 0.2" in verdict(unknown).cautions[0]
+    visited = edit_provenance(unknown, modes=modes | {"unvisited": 0.0})
+    assert not verdict(visited).cautions
+    missed = edit_provenance(unknown, modes=modes | {"unvisited": 0.2})
+    assert "another mode, of weight 0.2" in verdict(missed).cautions[0]
 
 
 def log_weights(width: float) -> np.ndarray:
