@@ -390,7 +390,7 @@ MOST_PROGRAMS = {
     "simulate": 1,
     "fit": 12,
     "fit again": 0,
-    "next views": 6,
+    "next views": 5,
     "identify": 2,
     "choose effects": 11,
     "report": 0,
