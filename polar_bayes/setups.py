@@ -75,6 +75,9 @@ class Setup(HTMLRepr):
 # that its prior keeps away from zero: half of this one is below .031, a quarter below .001.
 MAYBE_BARE = {"subsurface_fraction": Beta(0.2, 1.0)}
 
+UNSTATED = "polarimeter"
+"""Set-up of a capture that names none."""
+
 SETUPS: Mapping[str, Setup] = MappingProxyType(
     {
         "paper": Setup(

@@ -25,16 +25,16 @@ CODE = {
     "physics": 2752,
     "reporting": 3271,
     "scenes": 1771,
-    "own files": 1565,
+    "own files": 1566,
     "models": 320,
     "tests": 22711,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25562,
+    "code": 25563,
     "classes": 332,
-    "constants": 417,
+    "constants": 418,
     "Any": 177,
     "longest function": 80,
 }

@@ -30,7 +30,15 @@ from polar_bayes.priors import (
     prior_text,
     resolve_priors,
 )
-from polar_bayes.setups import SETUPS, Setup, as_read, default_priors, find_setup, setup_name
+from polar_bayes.setups import (
+    SETUPS,
+    UNSTATED,
+    Setup,
+    as_read,
+    default_priors,
+    find_setup,
+    setup_name,
+)
 
 MODELS: dict[str, Callable] = {
     "per_material": per_material,
@@ -100,7 +108,7 @@ def resolve(
     chosen_by = "caller"
     if scene is None:
         chosen_by = "capture" if "setup" in capture.attrs else "default"
-        scene = str(capture.attrs.get("setup", "polarimeter"))
+        scene = str(capture.attrs.get("setup", UNSTATED))
     setup, scene_name = _find_scene(scene, capture)
     setup = as_read(setup, capture)
     acting = [each for each in setup.known if all(name in capture for name in each.needs)]
