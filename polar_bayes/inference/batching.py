@@ -110,10 +110,6 @@ def cut(image: xr.Dataset, pixels: int) -> Iterator[dict[str, slice]]:
 # --- Status of each pixel, and the method used ----------------------------------------------------
 
 
-MIN_VIEWS = 2
-"""Fewest valid views with which a pixel is fitted."""
-
-
 class Status(enum.IntEnum):
     """Status of a pixel; the last is the value in chunks that were not written.
 

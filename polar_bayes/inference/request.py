@@ -12,7 +12,6 @@ from numpyro.primitives import Messenger
 
 from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, FitError
-from polar_bayes.inference.batching import MIN_VIEWS
 from polar_bayes.inference.model_parts import ModelParts, layout_of
 from polar_bayes.inference.program import ModelInfo, inspect_model
 from polar_bayes.inference.result import Provenance
@@ -45,6 +44,9 @@ MODELS: dict[str, Callable] = {
     "hierarchical": Hierarchical(),
     "gp_spectral": gp_spectral,
 }
+
+MIN_VIEWS = 2
+"""Fewest valid views with which a capture, or a pixel, is fitted."""
 
 _MODEL_INFO: LRUCache[ModelInfo] = LRUCache(32)
 

@@ -17,7 +17,6 @@ from polar_bayes.capture.schema import validate
 from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.inference.batching import (
     IMAGE,
-    MIN_VIEWS,
     MethodUsed,
     Status,
     batch_pixels,
@@ -25,7 +24,7 @@ from polar_bayes.inference.batching import (
 )
 from polar_bayes.inference.compiled_model import CompiledModel, compile_layout, layout_key
 from polar_bayes.inference.problem_batch import Outcome, ProblemBatch, problem_batch
-from polar_bayes.inference.request import Request, resolve
+from polar_bayes.inference.request import MIN_VIEWS, Request, resolve
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.maps.blocks import as_completed, workers
 from polar_bayes.maps.criticism import PROBLEMS, Criticism, PixelCriticism

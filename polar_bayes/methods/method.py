@@ -16,10 +16,11 @@ from jaxtyping import Array
 
 from polar_bayes import methods
 from polar_bayes.errors import FitError
-from polar_bayes.inference.batching import MIN_VIEWS, MethodUsed, Status
+from polar_bayes.inference.batching import MethodUsed, Status
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.problem_batch import BatchDraws, ProblemBatch
 from polar_bayes.inference.program import THREADS, Values
+from polar_bayes.inference.request import MIN_VIEWS
 from polar_bayes.inference.result import Provenance
 from polar_bayes.methods.registry import METHODS, method_names
 from polar_bayes.numerics.compile import TRACING_LOCK

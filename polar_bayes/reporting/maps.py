@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 from polar_bayes.diagnostics.coverage import INTERVALS, map_coverage, map_scalars
 from polar_bayes.diagnostics.parameters import Scalar
 from polar_bayes.errors import FitError, one_line
-from polar_bayes.inference.batching import IMAGE, MIN_VIEWS, Status, cut
+from polar_bayes.inference.batching import IMAGE, Status, cut
+from polar_bayes.inference.request import MIN_VIEWS
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.maps.lazy import (
     CHUNK,

@@ -29,7 +29,7 @@ from polar_bayes.diagnostics.predictive import predictive_checks
 from polar_bayes.diagnostics.sensitivity import sensitivity
 from polar_bayes.diagnostics.view import FitView, Provenance
 from polar_bayes.errors import one_line
-from polar_bayes.inference.batching import MIN_VIEWS
+from polar_bayes.inference.request import MIN_VIEWS
 from polar_bayes.methods.registry import METHODS
 from polar_bayes.numerics.psis import MAX_PARETO_K
 from polar_bayes.reporting.page import INSTALL
