@@ -14,7 +14,7 @@ CODE = {
     "calibration": 1035,
     "capture": 809,
     "cli": 1270,
-    "design": 1088,
+    "design": 1101,
     "diagnostics": 1810,
     "importers": 2098,
     "inference": 2722,
@@ -27,14 +27,14 @@ CODE = {
     "scenes": 1771,
     "own files": 1566,
     "models": 320,
-    "tests": 22711,
+    "tests": 22728,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25563,
+    "code": 25576,
     "classes": 332,
-    "constants": 418,
+    "constants": 419,
     "Any": 177,
     "longest function": 80,
 }

@@ -24,6 +24,7 @@ from polar_bayes.design.candidates import (
     view_directions,
 )
 from polar_bayes.design.fisher import (
+    STEP,
     information_by_view,
     positive_definite,
     prior_precision,
@@ -49,6 +50,7 @@ from polar_bayes.inference.problem import observe_request
 from polar_bayes.inference.program import PRIOR_DRAWS, from_prior
 from polar_bayes.inference.request import resolve
 from polar_bayes.inference.result import capture_of, provenance_of
+from polar_bayes.numerics.optimize import finite_sd
 from polar_bayes.observation.data import ANGLES, Observations
 from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
@@ -276,19 +278,19 @@ def _design(
     axes = data.shape[-2:] if by_wavelength else data.shape[-1:]
     is_predicted = "intensity" in problem.program.observed
 
-    def evaluate(z: Array, data: Observations) -> tuple[dict[str, Array], Array]:
+    def evaluate(z: Array, step: Array, data: Observations) -> tuple[dict[str, Array], Array]:
         if is_predicted:
             data = _with_predicted_brightness(extended, z, data, views.measured)
         jacobian = jax.jacfwd(lambda z: parameter_vector(program, z, data))(z)
-        return information_by_view(reading_information(program, z, data), axes), jacobian
+        return information_by_view(reading_information(program, z, data, step), axes), jacobian
 
-    def run(z: Array, center: Array, data: Observations) -> tuple[tuple, Array]:
-        of_draws = jax.lax.map(lambda one: evaluate(one, data), z)
+    def run(z: Array, center: Array, step: Array, data: Observations) -> tuple[tuple, Array]:
+        of_draws = jax.lax.map(lambda one: evaluate(one, step, data), z)
         return of_draws, prior_precision(program, center, data)
 
     # By what its trace depends on beside the model.
     name = f"information by {axes} of {views.measured} views, brightness {is_predicted}"
-    found = program.once(name, run)(z, center, data)
+    found = program.once(name, run)(z, center, STEP * finite_sd(extended.prior), data)
     (information, jacobian), hessian = jax.tree.map(np.asarray, found)
     size, many = program.size, data.shape[-1]
     by_view = {n: x.reshape(count, -1, many, size, size) for n, x in information.items()}
