@@ -23,22 +23,19 @@ from collections.abc import Collection, Mapping
 from types import MappingProxyType
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from jaxtyping import Array, ArrayLike
-from numpyro import distributions as dist
 
 from polar_bayes.diagnostics.alternatives import NOTHING
 from polar_bayes.errors import FitError, SceneError
-from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.initialization import HEAVY_MODE, JointInit
 from polar_bayes.inference.problem import Problem, compile_request, make_problem
-from polar_bayes.inference.program import Values
+from polar_bayes.inference.program import Values, from_prior
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import Provenance, posterior_of
 from polar_bayes.methods.method import AbstractMethod
-from polar_bayes.numerics.compile import JitOnce, OutOfTimeError, run_until
+from polar_bayes.numerics.compile import OutOfTimeError, run_until
 from polar_bayes.numerics.mcse import SMALLEST_ESS
 from polar_bayes.numerics.optimize import (
     DifferencedPotential,
@@ -282,34 +279,16 @@ def _with_scene(
     if not own:
         return potential, starts, covariance
     # What only the other scene has starts at the median of its prior.
-    moved = own + [name for name in both if name in INDICES]
-    draw = compiled_model.made(_prior_coordinates, tuple(moved))
-    medians, drawn = draw(jax.random.key_data(key))
-    for name in own:
-        starts[:, program.positions[name]] = medians[name]
+    drawn = from_prior(program, key, OTHER_STARTS, data)
+    added = np.hstack([program.positions[name].ravel() for name in own])
+    starts[:, added] = np.median(drawn[:, added], axis=0)
     if len(own) > 1:  # fringes have many modes: the likeliest of some draws, the index with them
+        indices = [program.positions[name].ravel() for name in both if name in INDICES]
+        moved = np.hstack([added, *indices])
         others = np.repeat(starts[:1], OTHER_STARTS, axis=0)
-        for name in moved:
-            others[:, program.positions[name]] = drawn[name]
+        others[:, moved] = drawn[:, moved]
         starts = np.vstack([starts, others[by_likelihood(potential, others)[:OTHER_SEARCHES]]])
     return potential, starts, covariance
-
-
-def _prior_coordinates(compiled_model: CompiledModel, names: tuple[str, ...]) -> JitOnce:
-    """The program of prior draws of parameters, as coordinates of their medians and of each."""
-
-    def draw(key: Array) -> tuple[dict[str, Array], dict[str, Array]]:
-        keys = jax.random.split(jax.random.wrap_key_data(key), len(names))
-        program, medians, drawn = compiled_model.program, {}, {}
-        for name, own in zip(names, keys, strict=True):
-            inverse = dist.biject_to(program.supports[name]).inv
-            prior, shape = compiled_model.priors[name], program.positions[name].shape
-            lead = shape[: len(shape) - len(prior.batch_shape)]  # each wavelength has its own
-            values = prior.sample(own, (OTHER_STARTS, *lead))
-            medians[name], drawn[name] = inverse(jnp.median(values, axis=0)), inverse(values)
-        return medians, drawn
-
-    return JitOnce(draw)
 
 
 def _log_evidence(potential: ValueAndGradient, modes: Modes) -> float:
