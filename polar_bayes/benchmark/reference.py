@@ -156,7 +156,7 @@ def _run(
     first, second = (
         half.reshape(len(draws), -1) for half in np.split(draws, [draws.shape[1] // 2], axis=1)
     )
-    biases = bias_doubts(found, problem)
+    biases = bias_doubts(found)
     apart = distances(first, second)["wasserstein"]
     run = ReferenceRun(labels, draws, name, mean_error, sd_error, apart, found, tuple(biases))
     if run.error <= settings.error:

@@ -192,10 +192,11 @@ def reading_information(
 
     def noise(z: Array) -> tuple[dict[str, Array], dict[str, dist.Distribution]]:
         trace = program.trace(z, data)
-        found = {name: unwrapped(trace[name]["fn"]) for name in program.observed}
+        found = {name: trace[name]["fn"] for name in program.observed}
         return {n: jnp.stack(information(each)[0], axis=-1) for n, each in found.items()}, found
 
-    # Slopes and distributions come from one pass, so the optics run once.
+    # Slopes and distributions come from one pass, so the optics run once; the information that is
+    # not read there is not compiled.
     if step is None:
         jacobians, distributions = jax.jacfwd(noise, has_aux=True)(z)
     else:
@@ -203,7 +204,7 @@ def reading_information(
     valid, readings = data.valid[..., None, None], {}
     for name, distribution in distributions.items():
         of_noise, matrix = information(distribution)
-        is_beta = isinstance(distribution, MeanConcentrationBeta)
+        is_beta = isinstance(unwrapped(distribution), MeanConcentrationBeta)
         readings[name] = ReadingInformation(
             jnp.where(valid, jacobians[name], 0.0),
             jnp.where(valid, matrix, 0.0),

@@ -178,8 +178,10 @@ def _angle(residuals: Residuals) -> Finding:
     )
     same = residuals.group[:, None] == residuals.group[None]
     kernels = []
-    for x in (x for x in coordinates if np.ptp(x, axis=0).max() > 1e-3):
+    for x in coordinates:
         # Where a coordinate does not vary, as the tilt of mirror views, all would be neighbors.
+        if np.ptp(x, axis=0).max() <= 1e-3:
+            continue
         apart = np.sum((x[:, None] - x[None]) ** 2, axis=-1)
         kernels += [
             np.where(same, np.exp(-0.5 * apart / math.radians(scale) ** 2), 0.0)

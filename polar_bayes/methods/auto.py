@@ -204,7 +204,7 @@ class Auto(AbstractMethod):
 
     def _judge(self, name: str, draws: PosteriorDraws, problem: Problem, begin: float) -> "Attempt":
         error = expected_error(draws, problem)
-        doubts = bias_doubts(draws, problem, self.largest_pareto_k)
+        doubts = bias_doubts(draws, self.largest_pareto_k)
         biased = bool(doubts)
         if self.tolerance is None:
             if not draws.ess >= SMALLEST_ESS:
@@ -273,9 +273,7 @@ class Attempt(NamedTuple):
         return texts | {name: _rounded(getattr(self, name)) for name in numbers}
 
 
-def bias_doubts(
-    draws: PosteriorDraws, problem: Problem, largest_pareto_k: float = MAX_PARETO_K
-) -> list[str]:
+def bias_doubts(draws: PosteriorDraws, largest_pareto_k: float = MAX_PARETO_K) -> list[str]:
     """Why draws may be biased."""
     doubts = draws.doubts
     if draws.pareto_k > largest_pareto_k and not doubts:
@@ -283,9 +281,7 @@ def bias_doubts(
     if draws.r_hat > LARGEST_R_HAT:
         doubts.append(f"its R-hat is {draws.r_hat:.3f}")
     # Where all chains began at one mode, R-hat cannot see the others.
-    if draws.method == "nuts" and (
-        (weight := problem.initialize().missed_mode_weight(draws.z)) > 0.0
-    ):
+    if (weight := draws.metadata.get("modes", {}).get("unvisited", 0.0)) > 0.0:
         doubts.append(f"a mode of weight {weight:.2g} was not visited by every chain")
     return doubts
 

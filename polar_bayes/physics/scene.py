@@ -241,7 +241,9 @@ class Scene(HTMLRepr):
 
     def _with_quantities(self, terms: tuple[AbstractInstrumentTerm, ...]) -> "Scene":
         """The scene with other input quantities, which are no effects: its ledger stays true."""
-        found = self if terms == self.terms else self._with_terms(terms)
+        if terms == self.terms:
+            return self
+        found = self._with_terms(terms)
         if self.ledger is not None:
             object.__setattr__(found, "ledger", self.ledger)
         return found
