@@ -107,7 +107,8 @@ def table(studies: dict[str, xr.DataTree], trials: dict[str, tuple[str, float]])
     for name, found in studies.items():
         method, error = trials[name]
         seen = "" if np.isnan(error) else f"{method}: {error:.2g} sd"
-        lines.append(f"| {name} | {pb.benchmark.accuracy_sentences(found, TOLERANCE)} | {seen} |")
+        advice = " ".join(pb.benchmark.accuracy_sentences(found, TOLERANCE))
+        lines.append(f"| {name} | {advice} | {seen} |")
     return "\n".join(lines)
 
 

@@ -66,7 +66,10 @@ class Mirrored(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class World:
-    """A simulated scene, a change of the readings, and the set-up that is fitted."""
+    """A simulated scene, a change of the readings, the set-up that is fitted, and by what method.
+
+    Without a method of its own, a world is fitted by the one that is asked for.
+    """
 
     setup: str
     preset: str = "plastic"
@@ -74,7 +77,7 @@ class World:
     parameters: Mapping[str, float] = dataclasses.field(default_factory=dict)
     noise: Mapping[str, float] = dataclasses.field(default_factory=dict)
     change: Change = unchanged
-    method: str = "nuts"
+    method: str = ""
     largest_view_zenith: float = 85.0
     azimuths: tuple[float, ...] = (180.0, 150.0, 120.0, 60.0)
     wavelengths: tuple[float, ...] = ()
@@ -355,20 +358,25 @@ def judge(capture: xr.Dataset, truth: Mapping[str, float], **settings: Any) -> d
     }
 
 
-def wrong(fits: int, *, readings: int = READINGS, chosen: bool = False) -> Any:
+def wrong(
+    fits: int, *, readings: int = READINGS, chosen: bool = False, method: str = "auto"
+) -> Any:
     """Every wrong world, fitted by its set-up or by a chosen scene."""
     for seed in range(fits):
         for name, world in WRONG.items():
-            key = f"{name}{', scene chosen' * chosen}|{readings}|{seed}"
-            yield key, lambda w=world, s=seed: _wrong(w, readings, s, chosen=chosen)
+            used = world.method or method
+            key = f"{name}{', scene chosen' * chosen}, {used}|{readings}|{seed}"
+            yield key, lambda w=world, s=seed, m=used: _wrong(w, readings, s, m, chosen=chosen)
 
 
-def _wrong(world: World, readings: int, seed: int, *, chosen: bool) -> dict[str, Any]:
+def _wrong(
+    world: World, readings: int, seed: int, method: str, *, chosen: bool
+) -> dict[str, Any]:
     capture = world.capture(readings, seed).assign_attrs(setup=world.setup)
     found = {n: capture.get(f"true_{n}") for n in MATERIAL}
     truth = {n: x.to_numpy().ravel()[0] for n, x in found.items() if x is not None}
     scene = "auto" if chosen else world.setup
-    return judge(capture, truth, scene=scene, method=world.method, seed=seed)
+    return judge(capture, truth, scene=scene, method=method, seed=seed)
 
 
 PLATE = Mirrored(views=30, largest_view_zenith=78.0, azimuths=(180.0,), wavelengths=())
@@ -381,7 +389,7 @@ RIGHT: tuple[tuple[str, Protocol], ...] = (
 """Set-ups and layouts of right models."""
 
 
-def right(fits: int, *, perfect: bool = False, method: str = "nuts") -> Any:
+def right(fits: int, *, perfect: bool = False, method: str = "auto") -> Any:
     """Right models: truth from the priors, or a bare surface and a perfect instrument."""
     for setup, layout in RIGHT:
         for seed in range(fits):
@@ -521,7 +529,7 @@ def main() -> None:
     parser.add_argument("--fits", type=int, default=5)
     parser.add_argument("--chosen", action="store_true", help="wrong: the fit chooses its scene")
     parser.add_argument("--readings", type=int, default=READINGS, help="wrong: of each variable")
-    parser.add_argument("--method", default="nuts", help="right, perfect: of the fits")
+    parser.add_argument("--method", default="auto", help="right, perfect, wrong: of the fits")
     parser.add_argument("--only", default="", help="worlds whose name holds this text")
     parser.add_argument("--keep", type=Path, help="file of JSON lines", default="criticism.jsonl")
     asked = parser.parse_args()
@@ -537,11 +545,16 @@ def main() -> None:
     worlds = {
         "right": functools.partial(right, method=asked.method),
         "perfect": functools.partial(right, perfect=True, method=asked.method),
-        "wrong": functools.partial(wrong, readings=asked.readings, chosen=asked.chosen),
+        "wrong": functools.partial(
+            wrong, readings=asked.readings, chosen=asked.chosen, method=asked.method
+        ),
         "chosen": chosen,
     }
-    for key, run in worlds[asked.part](asked.fits):
-        if key in done or asked.only not in key:
+    called = {key: run for key, run in worlds[asked.part](asked.fits) if asked.only in key}
+    if not called:
+        parser.error(f"no fit's name holds {asked.only!r}")
+    for key, run in called.items():
+        if key in done:
             continue
         try:
             found = run()

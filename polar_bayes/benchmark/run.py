@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Collection
 from pathlib import Path
 from subprocess import PIPE
 from typing import ClassVar, NamedTuple, override
@@ -35,7 +36,7 @@ from polar_bayes.numerics.compile import LRUCache
 from polar_bayes.numerics.psis import CHAINS, numpy_generator
 from polar_bayes.paths import temporary_folder
 from polar_bayes.physics.facets import FacetQuadrature
-from polar_bayes.physics.scene import Scene
+from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 from polar_bayes.physics.variants import Effect, parts_of, simplify
 from polar_bayes.progress import no_progress
 from polar_bayes.scenes.effects import choose_effects
@@ -83,10 +84,13 @@ def run_trial(trial: Trial) -> TrialResult:
 
 
 def labeled(
-    problem: Problem, z: Float[np.ndarray, "chain draw size"]
+    problem: Problem,
+    z: Float[np.ndarray, "chain draw size"],
+    without: Collection[str] = (),
 ) -> tuple[tuple[str, ...], Float[np.ndarray, "parameter chain draw"]]:
-    """Return labels, and values (parameter, chain, draw), of all scalar parameters."""
-    found = scalars(posterior_of(problem.program, problem.constrain(z)))
+    """Return labels, and values (parameter, chain, draw), of all scalar parameters but some."""
+    every = scalars(posterior_of(problem.program, problem.constrain(z)))
+    found = [each for each in every if each.name not in without]
     return tuple(each.label for each in found), np.stack([each.draws for each in found])
 
 
@@ -95,9 +99,13 @@ def _run(trial: Trial, seed: int) -> tuple[PosteriorDraws, tuple[str, ...], np.n
     key_search, key_draws = jax.random.split(jax.random.key(seed))
     problem = make_problem(trial.request, key_search)
     found = trial.method.run(problem, key_draws, no_progress)
-    if found.covariance is not None:
-        found = sample_point(found, key_draws)
-    return found, *labeled(problem, found.z)
+    if found.covariance is None:
+        return found, *labeled(problem, found.z)
+    # Least squares has no scales of noise: their values are those of its start.
+    errors = found.metadata["standard_errors"]
+    guesses = {name for name, each in errors.items() if None in each} - {*MATERIAL_PARAMETERS}
+    found = sample_point(found, key_draws)
+    return found, *labeled(problem, found.z, guesses)
 
 
 def sample_point(found: PosteriorDraws, key: Array, count: int = 1000) -> PosteriorDraws:

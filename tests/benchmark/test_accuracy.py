@@ -15,7 +15,8 @@ import polar_bayes as pb
 from polar_bayes.benchmark import run
 from polar_bayes.benchmark.advice import AS_GIVEN
 from polar_bayes.benchmark.reference import ReferenceRun, best_reference, run_reference
-from polar_bayes.benchmark.run import AbstractOverride, Trial, run_in_subprocess
+from polar_bayes.benchmark.run import AbstractOverride, Trial, run_in_subprocess, run_trial
+from polar_bayes.inference.request import resolve
 from polar_bayes.methods.method import AbstractMethod, PosteriorDraws
 from polar_bayes.numerics.mcse import standard_errors
 from polar_bayes.numerics.psis import resampled_chains
@@ -148,6 +149,19 @@ def test_dials_turn_what_they_can_and_leave_the_rest_out(study):
     assert table[["seconds_first", "peak_memory"]].isna().all(axis=None)
     assert (table.loc[["biased", "right"], "seconds_again"] > 0.0).all()
     assert json.loads(study.attrs["polar_bayes"])["fresh_processes"] is False
+
+
+@pytest.mark.thorough
+def test_what_least_squares_does_not_estimate_is_left_out():
+    plate = pb.simulate("glass", scene="goniometer", seed=0)
+    request = resolve(plate, "per_material", "goniometer", None, None, None, 0, "double")
+    chains, point = (
+        run_trial(Trial(request, method)).labels
+        for method in (pb.methods.Nuts(draws=100, most_draws=100), pb.methods.Point(starts=2))
+    )
+    assert set(point) < set(chains)
+    assert {"stokes_error_factor", "discrepancy_amplitude"} <= set(chains) - set(point)
+    assert {x for x in chains if x.startswith(("refractive_index", "subsurface"))} <= set(point)
 
 
 @pytest.mark.thorough
