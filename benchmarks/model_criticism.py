@@ -369,9 +369,7 @@ def wrong(
             yield key, lambda w=world, s=seed, m=used: _wrong(w, readings, s, m, chosen=chosen)
 
 
-def _wrong(
-    world: World, readings: int, seed: int, method: str, *, chosen: bool
-) -> dict[str, Any]:
+def _wrong(world: World, readings: int, seed: int, method: str, *, chosen: bool) -> dict[str, Any]:
     capture = world.capture(readings, seed).assign_attrs(setup=world.setup)
     found = {n: capture.get(f"true_{n}") for n in MATERIAL}
     truth = {n: x.to_numpy().ravel()[0] for n, x in found.items() if x is not None}
