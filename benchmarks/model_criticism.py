@@ -36,6 +36,7 @@ from polar_bayes.diagnostics.criticism import criticize
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.observation.links import noise_parameters
 from polar_bayes.scenes import scene_library
+from polar_bayes.scenes.neighbors import INDICES_UNDER
 from polar_bayes.setups import SETUPS
 from polar_bayes.simulation import Protocol
 
@@ -44,7 +45,8 @@ COST_FITS = 5
 now = time.perf_counter
 MISS = 2.0
 MATERIAL = ("roughness", "subsurface_fraction", "absorption", "refractive_index")
-BODY = "subsurface_fraction"
+BODY, INDEX = "subsurface_fraction", "refractive_index"
+UNDER_WATER = INDICES_UNDER["water film"][0][1]  # the largest index that a film of water gives
 PAPER, CAMERA, GONIOMETER = (SETUPS[name].scene for name in ("paper", "camera", "goniometer"))
 Change = Callable[[xr.Dataset, np.random.Generator], xr.Dataset]
 
@@ -170,12 +172,15 @@ def counted(count: Callable[[Any], Any]) -> Change:
 
     def change(capture: xr.Dataset, random: np.random.Generator) -> xr.Dataset:
         del random
-        light = capture["intensity"] / capture["intensity"].max()
+        full = float(capture["intensity"].max())
+        light = capture["intensity"] / full
         found = {}
         for name in ("q", "u"):
             one, other = (count(0.5 * light * (1.0 + sign * capture[name])) for sign in (1.0, -1.0))
             found[name] = np.clip((one - other) / (one + other), -0.999, 0.999)
-        return capture.assign({**found, "intensity": count(light)})
+        level = count(capture["intensity"].attrs["saturation_level"] / full)
+        counts = count(light).assign_attrs(saturation_level=float(level))
+        return capture.assign({**found, "intensity": counts})
 
     return change
 
@@ -347,6 +352,7 @@ def judge(capture: xr.Dataset, truth: Mapping[str, float], **settings: Any) -> d
         for name, row in rows.items()
     }
     return {
+        "truth": {name: float(value) for name, value in truth.items()},
         "holds": {name: bool(miss <= 0.0) for name, miss in misses.items()},
         "levels": table["level"].to_dict(),
         "p_values": {name: p for name, p in table["p_value"].items() if np.isfinite(p)},
@@ -518,8 +524,34 @@ def wilson(hits: int, count: int) -> str:
     return f"{hits / count:.1%} [{interval.low:.1%}, {interval.high:.1%}]"
 
 
+def summarize(lines: list[dict[str, Any]]) -> None:
+    """Print the table of all results, and shares of fits."""
+    found = table(lines)
+    print(found.to_string(float_format="{:.2f}".format))
+    levels = pd.DataFrame([line["levels"] for line in lines])
+    print(levels.apply(lambda column: column.value_counts(normalize=True)).T.to_string())
+    failed = sum(line["problems"] > 0 for line in lines)
+    silent = round(float((found["silent_and_wrong"] * found["fits"]).sum()))
+    print("with a problem:", wilson(failed, len(lines)))
+    against = sum(line.get("against", 0) > 0 for line in lines)
+    print("with a problem of the model, not of the method:", wilson(against, len(lines)))
+    flagged = [line["problems"] + line["cautions"] > 0 for line in lines]
+    print("with a problem or a caution:", wilson(sum(flagged), len(lines)))
+    index = np.array([line.get("truth", {}).get(INDEX, np.nan) for line in lines])
+    for what, where in {"at most": index <= UNDER_WATER, "above": index > UNDER_WATER}.items():
+        if where.any():
+            share = wilson(int(np.sum(flagged, where=where)), int(where.sum()))
+            print(f"with a problem or a caution where n is {what} {UNDER_WATER}:", share)
+    print("silent and wrong:", wilson(silent, len(lines)))
+    held = pd.DataFrame([line.get("holds", {}) for line in lines])
+    for name, column in held.items():
+        known = column.dropna()
+        print(f"95% interval of {name} holds:", wilson(int(known.sum()), known.size))
+    print("machine:", platform.machine(), "python", platform.python_version())
+
+
 def main() -> None:
-    """Run the selected cases, and print the table of all results."""
+    """Run the selected cases, and print what all of them gave."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
@@ -562,23 +594,7 @@ def main() -> None:
         lines.append({"key": key, **found})
         with asked.keep.open("a") as file:
             file.write(json.dumps(lines[-1]) + "\n")
-    found = table(lines)
-    print(found.to_string(float_format="{:.2f}".format))
-    levels = pd.DataFrame([line["levels"] for line in lines])
-    print(levels.apply(lambda column: column.value_counts(normalize=True)).T.to_string())
-    failed = sum(line["problems"] > 0 for line in lines)
-    silent = round(float((found["silent_and_wrong"] * found["fits"]).sum()))
-    print("with a problem:", wilson(failed, len(lines)))
-    against = sum(line.get("against", 0) > 0 for line in lines)
-    print("with a problem of the model, not of the method:", wilson(against, len(lines)))
-    flagged = sum(line["problems"] + line["cautions"] > 0 for line in lines)
-    print("with a problem or a caution:", wilson(flagged, len(lines)))
-    print("silent and wrong:", wilson(silent, len(lines)))
-    held = pd.DataFrame([line.get("holds", {}) for line in lines])
-    for name, column in held.items():
-        known = column.dropna()
-        print(f"95% interval of {name} holds:", wilson(int(known.sum()), known.size))
-    print("machine:", platform.machine(), "python", platform.python_version())
+    summarize(lines)
 
 
 if __name__ == "__main__":

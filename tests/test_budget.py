@@ -10,16 +10,16 @@ from cases import each
 ROOT = Path(__file__).parents[1]
 
 CODE = {
-    "benchmark": 574,
+    "benchmark": 580,
     "calibration": 1035,
-    "capture": 809,
+    "capture": 832,
     "cli": 1270,
     "design": 1101,
     "diagnostics": 1812,
     "importers": 2098,
     "inference": 2722,
     "maps": 1705,
-    "methods": 1264,
+    "methods": 1265,
     "numerics": 997,
     "observation": 507,
     "physics": 2754,
@@ -27,12 +27,12 @@ CODE = {
     "scenes": 1758,
     "own files": 1566,
     "models": 320,
-    "tests": 22728,
+    "tests": 22767,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25563,
+    "code": 25593,
     "classes": 332,
     "constants": 419,
     "Any": 177,

@@ -164,7 +164,7 @@ def cautions(capture: xr.Dataset) -> tuple[str, ...]:
         A sentence for each, none for a capture in which nothing is unlikely.
     """
     found = [*_azimuth_cautions(capture), *_excess_cautions(capture), *_gamma_cautions(capture)]
-    for check in (_sign_cautions, _side_cautions, _scale_cautions):
+    for check in (_sign_cautions, _side_cautions, _scale_cautions, _ceiling_cautions):
         found += [each for name, part in _materials(capture) for each in check(name, part)]
     return tuple(dict.fromkeys(found))
 
@@ -372,6 +372,36 @@ def _scale_cautions(name: str, capture: xr.Dataset) -> Iterator[str]:
             f"The polarization{name} {peak.below_vacuum}: the angles were likely counted from the "
             "surface, which an import takes by angle_is='from-surface'."
         )
+
+
+def _ceiling_cautions(name: str, capture: xr.Dataset) -> Iterator[str]:
+    """Caution against readings that stop at one value below full scale: a sensor's limit."""
+    if {"y", "x"} & set(capture.dims):
+        return
+    for signal in (each for each in ("dop", "q", "u", "intensity") if each in capture):
+        readings = capture[signal].where(_valid(capture))
+        limit = readings.attrs.get("saturation_level", math.inf) if signal == "intensity" else 1.0
+        by_color = readings.transpose("wavelength", ...) if "wavelength" in readings.dims else None
+        for color in [readings] if by_color is None else by_color:
+            value, count = _ceiling(color.to_numpy())
+            if count and value < 0.999 * limit:
+                wavelength = "" if by_color is None else f" at {float(color['wavelength']):g} nm"
+                yield (
+                    f"The {count} largest readings of {signal}{wavelength}{name} are {value:.4g} "
+                    "in every digit, and no others are so alike: a channel likely saturates there. "
+                    "Expose less, or mask these views (valid = 0)."
+                )
+
+
+def _ceiling(readings: np.ndarray) -> tuple[float, int]:
+    """Return the largest reading and how many have it, or 0 where that is no sign of a limit."""
+    values, counts = np.unique(readings[np.isfinite(readings)], return_counts=True)
+    if len(values) < 2 * SMALLEST_VIEWS or counts[-1] <= 2 * counts[:-1].max():
+        return 0.0, 0
+    # A smooth peak repeats in every digit, too, but falls by few of the smallest steps beside.
+    digits = next((n for n in range(15) if np.array_equal(values.round(n), values)), 15)
+    falls = values[-1] - values[-2] > 5.0 * 10.0**-digits
+    return float(values[-1]), int(counts[-1]) if falls else 0
 
 
 # --- What was inferred ----------------------------------------------------------------------------

@@ -7,12 +7,9 @@ from polar_bayes.methods.method import AbstractMethod, make_method
 from polar_bayes.methods.nuts import Nuts
 from polar_bayes.methods.registry import method_names
 
-CHAINS = ("nuts", "auto")
-"""Methods that run chains, of which a study has three lengths."""
-
 STUDY_METHODS: Mapping[str, AbstractMethod] = MappingProxyType(
     {
-        **{name: make_method(name) for name in method_names(one=True) if name not in CHAINS},
+        **{n: make_method(n) for n in method_names(one=True) if n not in ("nuts", "auto")},
         "nuts short": Nuts(warmup=100, draws=100, most_draws=100),
         "nuts": Nuts(),
         "nuts long": Nuts(warmup=1000, draws=4000, most_draws=4000),

@@ -165,6 +165,38 @@ def test_more_than_full_polarization_is_cautioned_where_errors_forbid_it(error, 
     assert not cautious or "4 of 4 readings have sqrt(q^2 + u^2) above 1" in said[0]
 
 
+@each(
+    ("scene", "signal", "wavelengths"),
+    [("polarimeter", "dop", ()), ("camera", "q", (450.0, 550.0)), ("camera", "intensity", ())],
+)
+def test_a_limit_of_a_sensor_that_no_file_states_is_cautioned(scene, signal, wavelengths):
+    protocol = pb.simulation.Protocol(views=40, wavelengths=wavelengths)
+    capture = pb.simulate("plastic", scene=scene, protocol=protocol, seed=0)
+    limit = float(capture[signal].isel(wavelength=-1, missing_dims="ignore").quantile(0.9))
+    clipped = capture.assign({signal: np.minimum(capture[signal], limit).assign_attrs(units="")})
+    *_, sentence = cautions(validate(clipped))
+    assert sentence.startswith(f"The 4 largest readings of {signal}")
+    assert f" are {limit:.4g} in every digit" in sentence
+    assert cautions(validate(clipped.assign(valid=clipped[signal] < limit))) == ()
+    clipped[signal].attrs["saturation_level"] = limit
+    assert bool(cautions(validate(clipped))) == (signal != "intensity")
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    index=st.floats(1.2, 2.2),
+    body=st.floats(0.0, 0.5),
+    step=st.sampled_from([0.5, 1.0, 2.0, 2.5, 5.0]),
+    digits=st.integers(0, 6),
+    repeats=st.integers(1, 4),
+)
+def test_a_peak_that_a_table_rounds_is_no_limit(index, body, step, digits, repeats):
+    zenith = np.arange(20.0, 80.0, step).repeat(repeats)
+    s, p = fresnel(zenith, index)
+    q = ((s - p) / (s + p + body)).round(digits)
+    assert cautions(validate(at_mirror(zenith, q=q))) == ()
+
+
 @pytest.mark.thorough
 @settings(max_examples=25, deadline=None)
 @given(
