@@ -8,36 +8,16 @@ and near Brewster's angle an index below explains it as well as one above.
 import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, override
+from typing import Any
 
-import numpy as np
 import xarray as xr
 from one_material import SCENE
 
 import polar_bayes as pb
+from polar_bayes.simulation import MirrorScan
 
 PLATE = pb.Scene(pb.SmoothSurface(), pb.Unpolarized(), pb.StokesMixing())
 SIGNED = {"q": pb.links.StokesLink(stated_errors=True)}
-
-
-@dataclasses.dataclass(frozen=True)
-class Mirror(pb.simulation.Protocol):
-    """Every view in the mirror direction of the light, between two zeniths.
-
-    Args:
-        smallest: Smallest view zenith, unit degree.
-    """
-
-    smallest: float = 20.0
-
-    @override
-    def angles(self) -> dict[str, np.ndarray]:
-        zenith = np.linspace(self.smallest, self.largest_view_zenith, self.views)
-        turned = {"view_zenith": zenith, "light_zenith": zenith}
-        return turned | {
-            "view_azimuth": np.full(self.views, 180.0),
-            "light_azimuth": np.zeros(self.views),
-        }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,10 +61,10 @@ ONE_COLOR: dict[str, Any] = {"wavelengths": ()}
 CASES: Mapping[str, Case] = MappingProxyType(
     {
         "smooth glass, 40 views": Case(
-            "glass", PLATE, Mirror(views=40, largest_view_zenith=78.0, **ONE_COLOR), SIGNED
+            "glass", PLATE, MirrorScan(views=40, largest_view_zenith=78.0, **ONE_COLOR), SIGNED
         ),
         "smooth glass, 6 views": Case(
-            "glass", PLATE, Mirror(views=6, largest_view_zenith=78.0, **ONE_COLOR), SIGNED
+            "glass", PLATE, MirrorScan(views=6, largest_view_zenith=78.0, **ONE_COLOR), SIGNED
         ),
         "leaf, 40 views": Case("leaf", SCENE, pb.simulation.Protocol(views=40, **ONE_COLOR)),
         "glossy, fraction near 0": Case(
@@ -96,13 +76,13 @@ CASES: Mapping[str, Case] = MappingProxyType(
         "few grazing views, DoP alone": Case(
             "fruit",
             SCENE,
-            Mirror(views=8, smallest=70.0, largest_view_zenith=86.0, **ONE_COLOR),
+            MirrorScan(views=8, smallest_view_zenith=70.0, largest_view_zenith=86.0, **ONE_COLOR),
             keep=("dop",),
         ),
         "two views at Brewster's angle": Case(
             "glass",
             PLATE,
-            Mirror(views=2, smallest=55.0, largest_view_zenith=57.0, **ONE_COLOR),
+            MirrorScan(views=2, smallest_view_zenith=55.0, largest_view_zenith=57.0, **ONE_COLOR),
             SIGNED,
             truth=MappingProxyType({"subsurface_fraction": 0.05, "refractive_index": 1.40}),
         ),

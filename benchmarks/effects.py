@@ -9,7 +9,7 @@ takes some tens of minutes.
 import dataclasses
 import sys
 import time
-from typing import Any, override
+from typing import Any
 
 import jax
 import numpy as np
@@ -37,16 +37,6 @@ PAINT = pb.Scene(
         (pb.instrument.AngleZero(), pb.instrument.DolpGain(), pb.instrument.DarkLevel())
     ),
 )
-
-
-class Plate(pb.simulation.Protocol):
-    """A goniometer: the detector follows the mirror direction."""
-
-    @override
-    def angles(self) -> dict[str, np.ndarray]:
-        angles = super().angles()
-        zenith = np.linspace(15.0, self.largest_view_zenith, self.views)
-        return angles | {"view_zenith": zenith, "light_zenith": zenith}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +76,9 @@ CASES = {
         "glass",
         "goniometer",
         FULL_SCENES["goniometer"],
-        Plate(azimuths=(180.0,), largest_view_zenith=78.0, wavelengths=()),
+        pb.simulation.MirrorScan(
+            smallest_view_zenith=15.0, largest_view_zenith=78.0, wavelengths=()
+        ),
         {
             "angle_zero": 0.2,
             "leakage": 0.005,

@@ -38,7 +38,7 @@ from polar_bayes.observation.links import noise_parameters
 from polar_bayes.scenes import scene_library
 from polar_bayes.scenes.neighbors import INDICES_UNDER
 from polar_bayes.setups import SETUPS
-from polar_bayes.simulation import Protocol
+from polar_bayes.simulation import MirrorScan, Protocol
 
 READINGS = 40
 COST_FITS = 5
@@ -57,13 +57,14 @@ def unchanged(capture: xr.Dataset, random: np.random.Generator) -> xr.Dataset:
     return capture
 
 
-class Mirrored(Protocol):
-    """The light comes from the zenith angle of the view, as on a goniometer."""
-
-    def angles(self) -> dict[str, np.ndarray]:
-        """Directions of every view."""
-        found = super().angles()
-        return found | {"light_zenith": found["view_zenith"]}
+def mirror_scan(views: int, largest: float, wavelengths: tuple[float, ...] = ()) -> MirrorScan:
+    """Even steps from near the normal to a zenith, with the light on the other side."""
+    return MirrorScan(
+        views=views,
+        smallest_view_zenith=largest / views,
+        largest_view_zenith=largest,
+        wavelengths=wavelengths,
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,12 +94,7 @@ class World:
             azimuths=self.azimuths,
         )
         if self.setup == "goniometer":
-            protocol = Mirrored(
-                views=readings,
-                largest_view_zenith=78.0,
-                azimuths=(180.0,),
-                wavelengths=self.wavelengths,
-            )
+            protocol = mirror_scan(readings, 78.0, self.wavelengths)
         made = pb.simulate(
             self.preset,
             scene=self.truth or SETUPS[self.setup].scene,
@@ -383,12 +379,12 @@ def _wrong(world: World, readings: int, seed: int, method: str, *, chosen: bool)
     return judge(capture, truth, scene=scene, method=method, seed=seed)
 
 
-PLATE = Mirrored(views=30, largest_view_zenith=78.0, azimuths=(180.0,), wavelengths=())
+PLATE = mirror_scan(30, 78.0)
 RIGHT: tuple[tuple[str, Protocol], ...] = (
     ("polarimeter", Protocol(views=40, wavelengths=(), largest_view_zenith=80.0)),
     ("camera", Protocol(views=16, wavelengths=(), largest_view_zenith=80.0)),
     ("goniometer", PLATE),
-    ("picture", Mirrored(views=8, largest_view_zenith=70.0, azimuths=(180.0,), wavelengths=())),
+    ("picture", mirror_scan(8, 70.0)),
 )
 """Set-ups and layouts of right models."""
 

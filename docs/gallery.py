@@ -68,7 +68,7 @@ plt.show()
 # standard uncertainty of the roughness.
 
 # %% mystnb={"image": {"alt": "Bars of the standard uncertainty of the roughness by source"}}
-sources = pb.budget(fit).loc["roughness"].drop("sd").abs().sort_values()
+sources = pb.budget(fit).loc["roughness"].drop(["sd", "perfect"]).abs().sort_values()
 plt.barh(sources.index, sources, color=GREEN)
 plt.xlabel("standard uncertainty of the roughness")
 plt.show()
@@ -90,7 +90,7 @@ places = [
     )
 ]
 plt.plot(["now", *places], width, "o-", color=BLUE)
-plt.ylim(bottom=0.0)
+plt.ylim(0.0, 1.1 * float(width[0]))
 plt.xlabel("view added: zenith at azimuth")
 plt.ylabel("expected width of the 95% interval of n")
 plt.show()
@@ -150,8 +150,8 @@ plt.show()
 # kept](effects.md).
 
 # %% mystnb={"image": {"alt": "Bars of the change of the posterior without each effect"}}
-few = pb.simulation.Protocol(views=14, wavelengths=())
-glass = pb.simulate("glass", scene="goniometer", protocol=few, seed=0)
+scan = pb.simulation.MirrorScan(views=20, largest_view_zenith=78.0, wavelengths=())
+glass = pb.simulate("glass", scene="goniometer", protocol=scan, seed=0)
 ledger = pb.choose_effects(glass).ledger.sortby("change")
 plt.barh(ledger["effect"], ledger["change"], color=np.where(ledger["kept"], BLUE, GRAY))
 plt.axvline(ledger.attrs["tolerance"], color=VERMILLION, linestyle="--")

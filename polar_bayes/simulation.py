@@ -11,6 +11,7 @@ import dataclasses
 import functools
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import override
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +40,7 @@ from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import PRIORS, RANGES
 from polar_bayes.setups import SETUPS, Setup, find_setup, setup_name
 
-__all__ = ["PRESETS", "Material", "Protocol"]
+__all__ = ["PRESETS", "Material", "MirrorScan", "Protocol"]
 
 REFERENCE_WAVELENGTHS = (450.0, 550.0, 650.0)
 
@@ -152,6 +153,32 @@ class Protocol:
             "light_zenith": np.full(self.views, self.light_zenith),
             "light_azimuth": np.zeros(self.views),
         }
+
+
+@dataclasses.dataclass(frozen=True)
+class MirrorScan(Protocol):
+    """Views in the mirror direction of a light that moves along, as a goniometer scans a plate.
+
+    The azimuths and the light zenith of `Protocol` are not used.
+
+    Args:
+        smallest_view_zenith: Unit degree, range [0, largest_view_zenith].
+    """
+
+    smallest_view_zenith: float = 20.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0.0 <= self.smallest_view_zenith <= self.largest_view_zenith:
+            what = f"smallest_view_zenith is {self.smallest_view_zenith}"
+            hint = f"give degrees from 0 to {self.largest_view_zenith:g}, the largest"
+            raise CaptureError(what, where="MirrorScan", hint=hint)
+
+    @override
+    def angles(self) -> dict[str, np.ndarray]:
+        zenith = np.linspace(self.smallest_view_zenith, self.largest_view_zenith, self.views)
+        mirror = {"view_zenith": zenith, "light_zenith": zenith}
+        return super().angles() | mirror | {"view_azimuth": np.full(self.views, 180.0)}
 
 
 # --- Validation of parameters and noise -----------------------------------------------------------

@@ -13,7 +13,7 @@ CODE = {
     "benchmark": 580,
     "calibration": 1035,
     "capture": 832,
-    "cli": 1270,
+    "cli": 1272,
     "design": 1101,
     "diagnostics": 1812,
     "importers": 2098,
@@ -23,17 +23,17 @@ CODE = {
     "numerics": 997,
     "observation": 507,
     "physics": 2754,
-    "reporting": 3271,
+    "reporting": 3272,
     "scenes": 1758,
-    "own files": 1566,
+    "own files": 1580,
     "models": 320,
-    "tests": 22767,
+    "tests": 22775,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25593,
-    "classes": 332,
+    "code": 25610,
+    "classes": 333,
     "constants": 419,
     "Any": 177,
     "longest function": 80,

@@ -75,17 +75,19 @@ def _save_import(capture: "Capture", out: Path) -> None:
     "--largest-view-zenith", type=click.FloatRange(0.0, 90.0, min_open=True, max_open=True),
     default=85.0, help="Degrees.",
 )  # fmt: skip
+@option("--mirror", is_flag=True, help="Views in the mirror direction, from 20 degrees on.")
 @option(
     "--wavelength", "wavelengths", type=float, multiple=True, default=(450.0, 550.0, 650.0),
     help="Nanometers; give it once per wavelength.",
 )  # fmt: skip
 @seed_option
-def simulate(out: Path, **settings: Any) -> None:
-    """Draw a capture of a known material, by the paper's protocol."""
+def simulate(out: Path, *, mirror: bool, **settings: Any) -> None:
+    """Draw a capture of a known material, by the paper's protocol or in mirror directions."""
     names = "views", "largest_view_zenith", "wavelengths"  # a scene file says what is used
     protocol = {name: settings.pop(name) for name in names}
     settings = read_scene_options(settings)
-    _save(pb.simulate(protocol=pb.simulation.Protocol(**protocol), **settings), out)
+    views = pb.simulation.MirrorScan if mirror else pb.simulation.Protocol
+    _save(pb.simulate(protocol=views(**protocol), **settings), out)
 
 
 @command()

@@ -155,6 +155,7 @@ def estimate_panel(axes: Axes, ranks: Ranks) -> None:
     if is_log:
         limits = float(values.min()) / 1.2, float(values.max()) * 1.2
         axes.set(xscale="log", yscale="log")
+        axes.locator_params(numticks=4)  # labels of many decades would overlap
         style.plain_numbers(axes.xaxis, axes.yaxis)
     else:
         limits = style.padded_range(values, 0.05)

@@ -5,7 +5,7 @@ import pytest
 from cases import each
 
 from polar_bayes.errors import CaptureError
-from polar_bayes.simulation import Protocol
+from polar_bayes.simulation import MirrorScan, Protocol
 
 
 def test_the_default_is_the_papers():
@@ -38,6 +38,16 @@ def test_the_light_stands_still():
 def test_more_azimuths_than_views_are_not_all_used():
     angles = Protocol(views=2, azimuths=(180.0, 90.0, 0.0)).angles()
     np.testing.assert_array_equal(angles["view_azimuth"], [180.0, 90.0])
+
+
+def test_a_scan_looks_in_the_mirror_direction_of_its_light():
+    angles = MirrorScan(views=4, smallest_view_zenith=15.0, largest_view_zenith=75.0).angles()
+    for name in ("view_zenith", "light_zenith"):
+        np.testing.assert_allclose(angles[name], [15.0, 35.0, 55.0, 75.0], rtol=1e-15)
+    np.testing.assert_array_equal(angles["view_azimuth"] - angles["light_azimuth"], np.full(4, 180))
+    for smallest in (-1.0, 76.0, float("nan")):
+        with pytest.raises(CaptureError, match="smallest_view_zenith is .*; give degrees from 0"):
+            MirrorScan(smallest_view_zenith=smallest, largest_view_zenith=75.0)
 
 
 @each(
