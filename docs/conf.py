@@ -7,6 +7,7 @@ import os
 import re
 import sys
 from importlib.metadata import version as version_of
+from pathlib import Path
 
 from docutils import nodes
 from latex2mathml.converter import convert
@@ -81,6 +82,8 @@ intersphinx_mapping = (
     else {}
 )
 
+# The code of notebooks is wider than a column that has a list of contents at its side.
+NOTEBOOKS = [f"notebooks/{file.stem}" for file in Path(__file__).parent.glob("notebooks/*.py")]
 html_theme = "pydata_sphinx_theme"
 html_title = "polar_bayes"
 html_sidebars = {page: [] for page in ("index", "gallery")}
@@ -96,7 +99,7 @@ html_theme_options = {
     "show_toc_level": 2,
     "footer_start": ["copyright"],
     "footer_end": [],
-    "secondary_sidebar_items": ["page-toc"],
+    "secondary_sidebar_items": {"**": ["page-toc"], **{name: [] for name in NOTEBOOKS}},
 }
 
 

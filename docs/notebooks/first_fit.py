@@ -58,8 +58,8 @@ pb.summary(result).round(3)
 
 # %%
 print("converged:", verdict.passed)
-print("problems:", verdict.problems)
-print("cautions:", verdict.cautions)
+print("problems:", *verdict.problems)
+print("cautions:", *verdict.cautions)
 
 # %% [markdown]
 # There is no problem, but there is a caution: with a film of water on the plastic, another index

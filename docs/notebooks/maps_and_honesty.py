@@ -136,7 +136,7 @@ means = pb.maps.region_means(maps, shadow)
 pb.maps.region_table(means).round(4)
 
 # %%
-means.attrs["cautions"]
+print(*means.attrs["cautions"], sep="\n")
 
 # %% [markdown]
 # The interval is that of the map's own model, in which each pixel has a prior of its own. Where the

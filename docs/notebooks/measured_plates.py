@@ -63,7 +63,7 @@ plt.show()
 
 # %%
 result = pb.fit(capture, seed=0)
-print(pb.verdict(result).problems, pb.verdict(result).cautions)
+print(*pb.verdict(result).sentences, sep="\n")
 pb.summary(result)[["mean", "q2.5", "q97.5", "r_hat", "ess_bulk"]].round(3)
 
 # %% [markdown]
@@ -130,7 +130,7 @@ for name, fit in fits.items():
         "rms residual": check.residual_rms,
         "elpd": check.loo.elpd,
     }
-    print(name, pb.verdict(fit).problems, pb.verdict(fit).cautions)
+    print(f"{name}:", *pb.verdict(fit).problems, *pb.verdict(fit).cautions, sep="\n")
 rows["prior"] = {"share at 1.38 or below": float((fit["prior"]["refractive_index"] <= 1.38).mean())}
 pd.DataFrame(rows).T.round(4)
 

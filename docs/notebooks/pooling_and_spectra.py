@@ -52,7 +52,7 @@ common = {"scene": plate, "links": links, "seed": 0}
 apart = pb.fit(batch, method=pb.methods.Laplace(), **common)
 pooled = pb.fit(batch, model="hierarchical", method=pb.methods.Laplace(), **common)
 for name, fit in {"apart": apart, "pooled": pooled}.items():
-    print(name, pb.verdict(fit).problems, pb.verdict(fit).cautions)
+    print(f"{name}:", *pb.verdict(fit).sentences, sep="\n")
 pb.diagnostics.population_summary(pooled).round(3)
 
 # %% mystnb={"image": {"alt": "Intervals of the index of eight plates, alone and pooled"}}
@@ -100,7 +100,7 @@ model = pb.models.GpSpectral(coupled=("refractive_index",))
 coupled = pb.fit(colored, model=model, method=pb.methods.Laplace(), **common)
 alone = pb.fit(colored, method=pb.methods.Laplace(), **common)
 for name, fit in {"alone": alone, "coupled": coupled}.items():
-    print(name, pb.verdict(fit).problems, pb.verdict(fit).cautions)
+    print(f"{name}:", *pb.verdict(fit).sentences, sep="\n")
 
 # %% mystnb={"image": {"alt": "Index against wavelength, alone and coupled"}}
 asked = np.linspace(400.0, 800.0, 41)

@@ -31,7 +31,7 @@ capture = pb.from_table(
     ignored=["u"],
     name="river",
 )
-print(*pb.capture.cautions(capture), sep="\n")
+print(*pb.capture.inferred(capture), *pb.capture.cautions(capture), sep="\n")
 plt.errorbar(capture["view_zenith"], capture["q"], capture["q_error"], fmt=".")
 plt.xlabel("angle of incidence (degree)")
 plt.ylabel("q")

@@ -46,7 +46,7 @@ def test_a_scan_looks_in_the_mirror_direction_of_its_light():
         np.testing.assert_allclose(angles[name], [15.0, 35.0, 55.0, 75.0], rtol=1e-15)
     np.testing.assert_array_equal(angles["view_azimuth"] - angles["light_azimuth"], np.full(4, 180))
     for smallest in (-1.0, 76.0, float("nan")):
-        with pytest.raises(CaptureError, match="smallest_view_zenith is .*; give degrees from 0"):
+        with pytest.raises(CaptureError, match=r"smallest_view_zenith is .*; give degrees from 0"):
             MirrorScan(smallest_view_zenith=smallest, largest_view_zenith=75.0)
 
 
