@@ -61,11 +61,12 @@ pb.plots.plot_accuracy(study)
 
 # %% [markdown]
 # `error` is the largest error of any mean or standard deviation, in posterior standard deviations;
-# `worst` names the parameter. It is the factor on the stated errors each time: six readings
-# determine it poorly, and its posterior is skewed, unlike a normal distribution. Least squares has
-# no noise model and is off by more than one and a half. Weights help, chains help more. `resolved`
-# is False where the error is at most twice that of the reference: the study cannot resolve such
-# errors, and the figure is gray there.
+# `worst` names the parameter. For Laplace's approximation it is the factor on the stated errors: six
+# readings determine it poorly, and its posterior is skewed, unlike a normal distribution. Least
+# squares has no noise model, so that its row leaves the factor out, and is off by almost half a
+# standard deviation in the rest. Weights and chains come much nearer. `resolved` is False where the
+# error is at most twice that of the reference: the study cannot resolve such errors, and the figure
+# is gray there.
 #
 # The seconds are those of a second fit, when all programs are compiled, on the machine that built
 # this page and whatever else it did then.
@@ -73,7 +74,7 @@ pb.plots.plot_accuracy(study)
 # The same as a sentence:
 
 # %%
-print(pb.benchmark.accuracy_sentences(study))
+print(*pb.benchmark.accuracy_sentences(study))
 
 # %% [markdown]
 # This advice holds for this capture. With more readings a posterior is closer to a normal
@@ -93,10 +94,10 @@ print(*pb.inference.auto_sentences(result), sep="\n")
 pb.summary(result).round(3)
 
 # %% [markdown]
-# It ran importance sampling twice, the second time with more draws, and rejected it, because a few
-# draws have most of the weight. The study above shows that these draws are accurate, since it has a
-# reference; a choice without one has to be careful. Chains passed. Most of the seconds are
-# compilation, which a second fit of this layout does not pay.
+# Importance sampling passed: no few draws have most of the weight, and there are enough of them for
+# the tolerance. Where they are not enough, it runs again with more draws, and NUTS follows where the
+# weights do not reach all of the posterior. Most of the seconds are compilation, which a second fit
+# of this layout does not pay.
 #
 # No diagnostic here detects a wrong scene: every method is measured against the posterior, not
 # against the truth. [Measured data](measured_plates.py) shows the difference.

@@ -74,7 +74,7 @@ print(*pb.verdict(broken).sentences, sep="\n")
 pb.summary(broken).transpose()
 
 # %% [markdown]
-# The test detects it: the 95% intervals of the index contain about 82% of such truths, and the
+# The test detects it: the 95% intervals of the index contain about 88% of such truths, and the
 # ranks show the direction of the error. Two results are not affected. The noise
 # (`stokes_error_factor`) is still well calibrated, because that part of the model was right. And
 # the readings pass their own test: a fit that puts the index in the wrong place can still predict

@@ -68,9 +68,10 @@ print(pb.maps.count_pixels(maps))
 pb.plots.plot_maps(maps)
 
 # %% [markdown]
-# 723 pixels are good; the 45 of the highlight are masked, and have a status but no number. The
-# index (whose sd is drawn below its mean) is known well where the plate is bright, and hardly in
-# the shadow. An image of means alone would not show that.
+# 717 pixels are good. The readings of 6 contradict the model, as those of a few right pixels in a
+# thousand do by chance in each check, and the 45 of the highlight are masked: both have a status
+# but no number. The index (whose width is drawn below its mean) is known well where the plate is
+# bright, and hardly in the shadow. An image of means alone would not show that.
 #
 # ## Do the intervals hold?
 #
@@ -122,10 +123,11 @@ print(pb.maps.count_pixels(overconfident))
 pb.diagnostics.map_coverage(overconfident, image)[held].round(3)
 
 # %% [markdown]
-# The 95% intervals now contain two thirds of the truths, and the status of every pixel is still
-# good: its draws describe its posterior well, and it is the posterior that is wrong. No diagnostic
-# of a single pixel detects that, but the readings of all pixels would: fit the noise on a patch
-# first, or leave it unknown (slower, and wider).
+# In 504 pixels, the readings contradict so little noise, and the pixels have no answer. The 95%
+# intervals of the others contain only seven in ten truths, although their status is good: their
+# draws describe the posterior well, and it is the posterior that is wrong. Where so many pixels are
+# contradicted, do not trust the rest: fit the noise on a patch first, or leave it unknown (slower,
+# and wider).
 #
 # ## The mean of a region
 #

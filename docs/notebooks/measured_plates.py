@@ -2,7 +2,7 @@
 # # Measured data, from the raw file to a conclusion
 #
 # Simulated captures obey the model that fits them. Measured ones do not. This notebook has two
-# examples: a glass plate, whose readings a simple model fits well and wrongly; and white PTFE,
+# examples: a glass plate, whose readings a simple model fits closely but wrongly; and white PTFE,
 # where the paper's mixture fits better than the physics does, and gives the wrong index.
 #
 # The measurements belong to others and are not part of this project. To run this notebook, set
@@ -77,9 +77,9 @@ for part in ("discrepancy", "instrument"):
 
 # %% [markdown]
 # With all terms, the interval of the index contains 1.509. It is wide, because it includes possible
-# errors of the instrument. Without any instrument term it is nine times narrower and does not
-# contain the index. That fit, too, has no problem in its verdict: 39 smooth readings do not show
-# that the channels are off by some percent, since index and body can imitate it.
+# errors of the instrument. Without any instrument term it is ten times narrower and does not
+# contain the index. That fit looks close, since index and body imitate channels that are off by
+# some percent; only its residuals have structure over the angle, which `pb.compare_scenes` reports.
 #
 # ## PTFE: the better fit is the wrong one
 #

@@ -59,10 +59,10 @@ others = curve["others"].sel(kind="likelihood").isel(value=[0, curve.sizes["valu
 others.transpose("value", ...).to_pandas().round(3)
 
 # %% [markdown]
-# Nothing between 1.2 and 1.84 is excluded by the readings alone, although the table expects an sd
-# of 0.05. Both are right. Where the index is moved, absorption and exposure make up for it: at the
-# lower end a body that absorbs ten times as much, at the upper end one that does not absorb at all.
-# The table includes the prior, under which such bodies are rare. So the interval of the index in a
+# The readings alone exclude what is below 1.38 and nothing above, up to 1.84, although the table
+# expects an sd of 0.05. Both are right. Where the index is moved, absorption and exposure make up
+# for it: at the lower end a body that absorbs four times as much, at the upper end one that does
+# not absorb at all. The table includes the prior, under which such bodies are rare. So the interval of the index in a
 # fit of these eight views depends on the prior of the absorption, and a measured exposure or
 # absorption would be more valuable than it seems.
 #
@@ -85,8 +85,8 @@ print(*pb.verdict(views).sentences, sep="\n")
 pb.summary(views)
 
 # %% [markdown]
-# Two steep views on the mirror side, as the paper would take them, and one at 25 degrees. The index
-# gains a fifth, the roughness nothing: it was known before.
+# Two steep views on the mirror side, as the paper would take them, and one at 22.5 degrees. The
+# intervals of the index and of the other parameters become about a fifth narrower.
 #
 # ## How much do chosen views help?
 #
