@@ -61,8 +61,8 @@ pb.plots.plot_accuracy(study)
 
 # %% [markdown]
 # `error` is the largest error of any mean or standard deviation, in posterior standard deviations;
-# `worst` names the parameter. For Laplace's approximation it is the factor on the stated errors: six
-# readings determine it poorly, and its posterior is skewed, unlike a normal distribution. Least
+# `worst` names the parameter. For Laplace's approximation it is the factor on the stated errors:
+# six readings determine it poorly, and its posterior is skewed, unlike a normal distribution. Least
 # squares has no noise model, so that its row leaves the factor out, and is off by almost half a
 # standard deviation in the rest. Weights and chains come much nearer. `resolved` is False where the
 # error is at most twice that of the reference: the study cannot resolve such errors, and the figure
@@ -95,9 +95,9 @@ pb.summary(result).round(3)
 
 # %% [markdown]
 # Importance sampling passed: no few draws have most of the weight, and there are enough of them for
-# the tolerance. Where they are not enough, it runs again with more draws, and NUTS follows where the
-# weights do not reach all of the posterior. Most of the seconds are compilation, which a second fit
-# of this layout does not pay.
+# the tolerance. Where they are not enough, it runs again with more draws, and NUTS follows where
+# the weights do not reach all of the posterior. Most of the seconds are compilation, which a second
+# fit of this layout does not pay.
 #
 # No diagnostic here detects a wrong scene: every method is measured against the posterior, not
 # against the truth. [Measured data](measured_plates.py) shows the difference.

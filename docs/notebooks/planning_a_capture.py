@@ -62,9 +62,9 @@ others.transpose("value", ...).to_pandas().round(3)
 # The readings alone exclude what is below 1.38 and nothing above, up to 1.84, although the table
 # expects an sd of 0.05. Both are right. Where the index is moved, absorption and exposure make up
 # for it: at the lower end a body that absorbs four times as much, at the upper end one that does
-# not absorb at all. The table includes the prior, under which such bodies are rare. So the interval of the index in a
-# fit of these eight views depends on the prior of the absorption, and a measured exposure or
-# absorption would be more valuable than it seems.
+# not absorb at all. The table includes the prior, under which such bodies are rare. So the interval
+# of the index in a fit of these eight views depends on the prior of the absorption, and a measured
+# exposure or absorption would be more valuable than it seems.
 #
 # ## Where to look next
 #

@@ -76,8 +76,8 @@ plt.show()
 pd.DataFrame(rows).T.round(3)
 
 # %% [markdown]
-# Pooled intervals are a fifth narrower, and here they are nearer to the truth as well; of both, seven
-# of eight contain it. The plates are drawn towards each other because all of them are known
+# Pooled intervals are a fifth narrower, and here they are nearer to the truth as well; of both,
+# seven of eight contain it. The plates are drawn towards each other because all of them are known
 # poorly, and only as far as the readings allow: the population is inferred, too. Its spread is not
 # known well (`spread_q2.5` to `spread_q97.5`); eight members hardly determine it, and its prior
 # matters. Where members differ by far more than their errors, pooling changes next to nothing.

@@ -117,8 +117,8 @@ pd.concat({name: pb.summary(answer)[columns] for name, answer in answers.items()
 
 # %% [markdown]
 # The right sheet narrows the interval of the index to a third, the wrong one moves it to 1.60, with
-# as narrow an interval. No check of that fit fails, as far as draws of Laplace's approximation can be
-# judged. Where does the result come from?
+# as narrow an interval. No check of that fit fails, as far as draws of Laplace's approximation can
+# be judged. Where does the result come from?
 
 # %%
 sensed = ["width_left", "prior_sensitivity", "likelihood_sensitivity", "verdict", "remark"]
