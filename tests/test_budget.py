@@ -27,7 +27,7 @@ CODE = {
     "scenes": 1758,
     "own files": 1580,
     "models": 320,
-    "tests": 22775,
+    "tests": 22778,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 

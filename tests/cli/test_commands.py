@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import polar_bayes as pb
@@ -19,6 +20,9 @@ def test_simulate_writes_what_fit_reads(tmp_path: Path, capsys: pytest.CaptureFi
     assert capsys.readouterr().out.startswith(str(file))
     capture = pb.load_capture(file)
     assert dict(capture.sizes) == {"view": 8, "wavelength": 3}
+    assert main([*words, "--mirror", "--out", str(file)]) == 0
+    capture = pb.load_capture(file)
+    np.testing.assert_array_equal(capture["view_zenith"], capture["light_zenith"])
 
 
 @pytest.mark.thorough
