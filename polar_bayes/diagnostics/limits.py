@@ -58,6 +58,8 @@ class Limits:
     cut_off: float = 0.05
     # Stated errors within which a reading is no outlier, however little the others scatter.
     stated_errors: float = 3.0
+    # Degrees of freedom of the noise; with the most it is normal.
+    freedom: tuple[float, float] = (2.5, 1000.0)
     # Draws may give a reading more than all of the information about itself.
     leverage: float = 0.999
     # Change of a posterior mean without one reading that counts.

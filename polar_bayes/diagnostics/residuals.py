@@ -1,25 +1,28 @@
 r"""Residuals of a fit: structure, outliers, and readings that determine the answer.
 
 The residuals of the readings are compared with residuals of replicated readings. A replicate is
-drawn from the posterior predictive distribution, and refitted in the linear-Gaussian approximation:
-with C the posterior covariance of the noise-free readings and $\Sigma$ the covariance of the noise,
+drawn from the posterior predictive distribution, and refitted by one linear step: with C the
+posterior covariance of the noise-free readings, in units in which each reading has a Fisher
+information of 1, and $\psi$ the score of the noise (its negative log density's derivative),
 
-$$ e = (I - C \Sigma^{-1}) (\varepsilon + \mu - \mu_0) $$
+$$ e = \varepsilon - C \psi(\varepsilon) + (I - C) (\mu - \mu_0) $$
 
 is what remains after a fit of noise $\varepsilon$ and of readings $\mu$ that the prior expects at
-$\mu_0$. Its covariance is $\Sigma - C$, that of $R (R \varepsilon + m)$ in units of the noise, with
-$R = (I - C)^{1/2}$ and $m$ a posterior draw of the noise-free readings less their mean. Without the
-refit the observed residuals, which the parameters have absorbed in part, would look too small
-compared with those of the replicates; without the prior, too large where an uncertain set-up
-shifts all readings and they tell little of it.
-The same approximation tells the fit without reading i: with the leverage
-$h_i = C_{ii} / \Sigma_{ii}$ its residual is $e_i / (1 - h_i)$, whose standard deviation is
-$(1 - h_i)^{-1/2}$, and the mean of a parameter moves by its covariance with the noise-free reading
-times that residual.
+$\mu_0$. The last term has the covariance $C - C^2$, that of $(I - C)^{1/2} m$ with $m$ a posterior
+draw of the noise-free readings less their mean. Normal noise has $\psi(\varepsilon) = \varepsilon$;
+noise with long tails pulls the fit less than its size suggests, so that its outliers stay. The
+noise of each variable is taken for Student's t, with the degrees of freedom of its draws.
+
+Without the refit the observed residuals, which the parameters have absorbed in part, would look
+too small compared with those of the replicates; without the prior, too large where an uncertain
+set-up shifts all readings and they tell little of it.
+The same approximation tells the fit without reading i: with the leverage $h_i = C_{ii}$ its
+residual is $e_i / (1 - h_i)$, and the mean of a parameter moves by its covariance with the
+noise-free reading times $\psi(e_i) / (1 - h_i)$.
 
 Source: Gelman, Meng & Stern (1996), Statistica Sinica 6, 733 (posterior predictive assessment);
 Moran (1950), Biometrika 37, 17 (spatial autocorrelation); Cook (1977), Technometrics 19, 15
-(influence of one reading).
+(influence of one reading); Huber (1981), Robust Statistics (influence by the score).
 """
 
 import dataclasses
@@ -29,6 +32,7 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 import xarray as xr
+from scipy import optimize, stats
 
 from polar_bayes.diagnostics.approximation import smoothed_weights
 from polar_bayes.diagnostics.finding import Finding, judged_by, listed, p_text
@@ -48,13 +52,18 @@ class Residuals:
     observed: np.ndarray  # (reading,)
     replicated: np.ndarray  # (replicate, reading)
     stated: np.ndarray  # (reading,): stated errors, 0 where there is none
-    left_out: np.ndarray  # (reading,): one minus the leverage, the variance of the residual
+    left_out: np.ndarray  # (reading,): one minus the leverage
+    freedom: np.ndarray  # (reading,): degrees of freedom of the noise
     gains: np.ndarray  # (parameter, reading): correlation times sd of the noise-free reading
     parameters: tuple[str, ...]
     directions: np.ndarray  # (reading, 4), degree
     wavelength: np.ndarray  # (reading,): index
     group: np.ndarray  # (reading,): index of variable and material
     labels: tuple[str, ...]
+
+    def pull(self, e: np.ndarray) -> np.ndarray:
+        """Return the score of residuals (..., reading), by which they pull the fit."""
+        return _score(e, self.freedom)
 
 
 @once
@@ -86,12 +95,17 @@ def residuals_of(fit: FitView) -> Residuals | None:
     if keep.size < 4 or len(noise) < 100:
         return None
     noise, noise_free, sd = noise[:, keep] / sd[keep], noise_free[:, keep] / sd[keep], sd[keep]
+    variable = np.repeat(np.arange(len(variables)), [v.observed.size for v in variables])[keep]
+    tails = {k: _tails(noise[:, variable == k]) for k in np.unique(variable)}
+    freedom, unit = np.array([tails[k] for k in variable]).T
+    noise, noise_free, sd = noise / unit, noise_free / unit, sd * unit
     random = np.random.default_rng(0)
     pick = random.permutation(len(noise))[: LIMITS.replicates]
     centered = noise_free - noise_free.mean(axis=0)
     share, axes = np.linalg.eigh(centered.T @ centered / (len(centered) - 1))
-    root = (axes * np.sqrt(np.clip(1.0 - share, 0.0, None))) @ axes.T
-    replicated = (noise[pick] @ root + centered[pick]) @ root
+    share = np.clip(share, 0.0, 1.0)
+    absorbed, root = ((axes * scale) @ axes.T for scale in (share, np.sqrt(1.0 - share)))
+    replicated = noise[pick] - _score(noise[pick], freedom) @ absorbed + centered[pick] @ root
     material = {s.label: s.draws.ravel()[rows] for s in fit.scalars if s.is_material}
     material = {n: x for n, x in material.items() if np.isfinite(x).all() and np.ptp(x) > 0.0}
     scores = np.array([(x - x.mean()) / x.std() for x in material.values()]).reshape(
@@ -102,7 +116,8 @@ def residuals_of(fit: FitView) -> Residuals | None:
         observed=observed[keep] / sd - noise_free.mean(axis=0),
         replicated=replicated,
         stated=used["stated"].to_numpy() / sd,
-        left_out=np.maximum(replicated.var(axis=0), 1.0 - LIMITS.leverage),
+        left_out=np.maximum(1.0 - np.diagonal(absorbed), 1.0 - LIMITS.leverage),
+        freedom=freedom,
         gains=scores @ centered / (len(centered) - 1),
         parameters=tuple(material),
         directions=used[[*ANGLES]].to_numpy(float),
@@ -110,6 +125,31 @@ def residuals_of(fit: FitView) -> Residuals | None:
         group=pd.factorize(readings["group"])[0][keep],
         labels=tuple(used["label"]),
     )
+
+
+def _tails(noise: np.ndarray) -> tuple[float, float]:
+    """Return degrees of freedom of noise (draw, reading), and the unit of Fisher information 1.
+
+    They are those of the Student t distribution with the median and the 95% quantile of its size.
+    """
+    half, most = np.quantile(np.abs(noise), [0.5, 0.95])
+
+    def excess(freedom: float) -> float:
+        ends = stats.t.ppf([0.75, 0.975], freedom)
+        return float(ends[1] / ends[0] - most / half)
+
+    least, largest = LIMITS.freedom
+    freedom = least if excess(least) < 0.0 else largest
+    if excess(least) > 0.0 > excess(largest):
+        freedom = float(optimize.brentq(excess, least, largest))
+    scale = half / float(stats.t.ppf(0.75, freedom))
+    return freedom, scale * math.sqrt((freedom + 3.0) / (freedom + 1.0))
+
+
+def _score(e: np.ndarray, freedom: np.ndarray) -> np.ndarray:
+    """Return the score of Student's t at e (..., reading), in units of Fisher information 1."""
+    a = (freedom + 3.0) / (freedom + 1.0)
+    return (freedom + 1.0) * a * e / (freedom + a * e**2)
 
 
 def _cut_off(variable: FlatVariable) -> np.ndarray:
@@ -269,7 +309,8 @@ def _influence(residuals: Residuals) -> Finding:
 
     def contradiction(e: np.ndarray) -> np.ndarray:
         """Return leave-one-out residuals, in their sd, of readings that move the answer."""
-        moves = (gain * np.abs(e) > LIMITS.large_shift) & (left_out > LIMITS.known_too)
+        moves = gain * np.abs(residuals.pull(e)) > LIMITS.large_shift
+        moves &= left_out > LIMITS.known_too
         return np.where(moves, np.abs(e) / np.sqrt(left_out), 0.0)
 
     observed = contradiction(residuals.observed)
@@ -278,7 +319,7 @@ def _influence(residuals: Residuals) -> Finding:
         return Finding("passed")
     p_value = _p_value(largest, contradiction(residuals.replicated).max(axis=-1))
     order = np.argsort(-observed)[: int(np.sum(observed >= 0.75 * largest))]
-    moved = float((gain * np.abs(residuals.observed))[order].max())
+    moved = float((gain * np.abs(residuals.pull(residuals.observed)))[order].max())
     which = "A reading decides" if len(order) == 1 else f"{len(order)} readings decide"
     sentence = (
         f"{which} the answer against the others ({p_text(p_value)}): without "
