@@ -22,17 +22,17 @@ CODE = {
     "methods": 1265,
     "numerics": 997,
     "observation": 507,
-    "physics": 2754,
+    "physics": 2756,
     "reporting": 3272,
     "scenes": 1758,
     "own files": 1580,
     "models": 320,
-    "tests": 22778,
+    "tests": 22804,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25635,
+    "code": 25637,
     "classes": 333,
     "constants": 419,
     "Any": 177,

@@ -246,6 +246,8 @@ ABSENT: dict[str, Absence] = {
     "leakage": Absence(0.0, "no leakage between the channels"),
     "dolp_gain": Absence(1.0, "no loss of polarization in the polarizer"),
     "discrepancy_amplitude": Absence(0.0, "no smooth error over angle"),
+    "ambient_light_offset": Absence(0.0, "no ambient light"),
+    "polarization_loss_offset": Absence(0.0, "no loss of polarization"),
 }
 """Absence by parameter: a bare and smooth surface, and an instrument without faults."""
 

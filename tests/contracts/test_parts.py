@@ -14,9 +14,18 @@ from polar_bayes.errors import SceneError
 from polar_bayes.physics.coat import ClearCoat
 from polar_bayes.physics.dispersion import Sellmeier
 from polar_bayes.physics.instrument import AbstractInstrumentTerm
-from polar_bayes.physics.part import Part, check_part, check_setting, like, parameters_of, value_of
+from polar_bayes.physics.part import (
+    Part,
+    absence,
+    check_part,
+    check_setting,
+    like,
+    parameters_of,
+    value_of,
+)
 from polar_bayes.physics.stokes import Light
 from polar_bayes.physics.surface import RoughSurface, SmoothSurface
+from polar_bayes.priors import support_bounds
 
 SETTINGS: dict[type, tuple] = {
     pb.Disc: (5.0,),
@@ -119,6 +128,12 @@ def test_a_term_at_its_neutral_values_changes_nothing(term: AbstractInstrumentTe
     geometry = pb.Geometry(zeniths, jnp.full(4, 180.0), zeniths, jnp.zeros(4))
     light = Light(jnp.array([0.1, 0.2, 0.5, 1.0]), jnp.array([0.0, 0.4, 0.9, -0.3]), jnp.zeros(4))
     known = {name: jnp.array([value]) for name, value in term.neutral.items()}
+    # At an end of its prior, a fault that is not there is no conflict with the prior.
+    for name in term.neutral.keys() & pb.PRIORS.keys():
+        if term.neutral[name] in support_bounds(pb.PRIORS[name]):
+            fault = absence(name)
+            assert fault is not None
+            assert fault.value == term.neutral[name]
     # What has no neutral value must not matter then: weights of a function of amplitude 0.
     parameters = {name: known.get(name, jnp.ones((3, 1))) for name in term.parameters}
     for there, here in zip(term.aim(parameters, geometry)[:4], geometry[:4], strict=True):

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import xarray as xr
 from cases import each
-from plates import ON_PLATE, plates
+from plates import ON_PLATE, at_mirror, plates
 from scipy import stats
 from synthetic_results import SCALE, edit_provenance, make_result, replace
+from textbook import plate_q
 
 import polar_bayes as pb
 from polar_bayes.diagnostics.criticism import QUESTIONS, criticize
@@ -82,6 +83,32 @@ def test_residuals_of_a_few_mirror_views_are_flagged_as_seldom_as_is_stated() ->
         fit = pb.fit(plate, **ON_PLATE, method="importance")
         flagged += criticize(fit).loc["angle", "level"] != "passed"
     assert flagged < 6
+
+
+@pytest.mark.thorough
+def test_outliers_of_noise_with_long_tails_are_flagged_as_seldom_as_is_stated() -> None:
+    """Of 300 right captures as many cautions (2%) come once in a thousand."""
+    zenith, cautions = np.linspace(20.0, 78.0, 12), {"outliers": 0, "influence": 0}
+    tailed = ON_PLATE | {"links": {"q": pb.links.StokesLink(degrees_of_freedom=4.0)}}
+    for seed in range(300):
+        random = np.random.default_rng(seed)
+        q = plate_q(random.uniform(1.4, 1.6), 0.02, np.radians(zenith))
+        q = np.clip(q + 0.01 * random.standard_t(4.0, zenith.size), -1.0, 1.0)
+        table = criticize(pb.fit(at_mirror(zenith, q=q), **tailed, method="importance"))
+        for name in cautions:
+            cautions[name] += table.loc[name, "level"] not in ("passed", "note")
+    assert max(cautions.values()) <= stats.binom.isf(1e-3, 300, 0.02), cautions
+
+
+@pytest.mark.thorough
+@each("scene", ["polarimeter", "camera"])
+def test_a_bare_surface_before_a_perfect_instrument_passes(scene) -> None:
+    views = pb.simulation.Protocol(views=40, wavelengths=(), largest_view_zenith=78.0)
+    bare = {"protocol": views, "parameters": {"subsurface_fraction": 0.0}}
+    verdict = pb.verdict(pb.fit(pb.simulate("plastic", scene=scene, **bare, seed=0), scene=scene))
+    assert verdict.passed
+    assert not any("conflict" in caution for caution in verdict.cautions)
+    assert "no light from the body" in " ".join(verdict.findings)
 
 
 @pytest.mark.thorough
