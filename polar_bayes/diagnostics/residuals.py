@@ -3,7 +3,7 @@ r"""Residuals of a fit: structure, outliers, and readings that determine the ans
 The residuals of the readings are compared with residuals of replicated readings. A replicate is
 drawn from the posterior predictive distribution, and refitted by one linear step: with C the
 posterior covariance of the noise-free readings, in units in which each reading has a Fisher
-information of 1, and $\psi$ the score of the noise (its negative log density's derivative),
+information of 1, and $\psi$ the derivative of the noise's negative log density (its score),
 
 $$ e = \varepsilon - C \psi(\varepsilon) + (I - C) (\mu - \mu_0) $$
 
@@ -32,7 +32,7 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 import xarray as xr
-from scipy import optimize, stats
+from scipy import optimize, special
 
 from polar_bayes.diagnostics.approximation import smoothed_weights
 from polar_bayes.diagnostics.finding import Finding, judged_by, listed, p_text
@@ -135,14 +135,16 @@ def _tails(noise: np.ndarray) -> tuple[float, float]:
     half, most = np.quantile(np.abs(noise), [0.5, 0.95])
 
     def excess(freedom: float) -> float:
-        ends = stats.t.ppf([0.75, 0.975], freedom)
+        ends = special.stdtrit(freedom, [0.75, 0.975])
         return float(ends[1] / ends[0] - most / half)
 
     least, largest = LIMITS.freedom
+    if not half > 0.0:
+        return largest, 1.0
     freedom = least if excess(least) < 0.0 else largest
     if excess(least) > 0.0 > excess(largest):
         freedom = float(optimize.brentq(excess, least, largest))
-    scale = half / float(stats.t.ppf(0.75, freedom))
+    scale = half / float(special.stdtrit(freedom, 0.75))
     return freedom, scale * math.sqrt((freedom + 3.0) / (freedom + 1.0))
 
 
