@@ -163,6 +163,9 @@ class MirrorScan(Protocol):
 
     Args:
         smallest_view_zenith: Unit degree, range [0, largest_view_zenith].
+
+    Raises:
+        CaptureError: A value is outside its range.
     """
 
     smallest_view_zenith: float = 20.0
@@ -176,6 +179,7 @@ class MirrorScan(Protocol):
 
     @override
     def angles(self) -> dict[str, np.ndarray]:
+        """Return directions of every view, with even steps of the zenith; as those of `Protocol`."""
         zenith = np.linspace(self.smallest_view_zenith, self.largest_view_zenith, self.views)
         mirror = {"view_zenith": zenith, "light_zenith": zenith}
         return super().angles() | mirror | {"view_azimuth": np.full(self.views, 180.0)}
