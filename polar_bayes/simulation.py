@@ -179,7 +179,7 @@ class MirrorScan(Protocol):
 
     @override
     def angles(self) -> dict[str, np.ndarray]:
-        """Return directions of every view, with even steps of the zenith; as those of `Protocol`."""
+        """Return directions of every view, as `Protocol` does, with even steps of the zenith."""
         zenith = np.linspace(self.smallest_view_zenith, self.largest_view_zenith, self.views)
         mirror = {"view_zenith": zenith, "light_zenith": zenith}
         return super().angles() | mirror | {"view_azimuth": np.full(self.views, 180.0)}
