@@ -13,7 +13,7 @@ CODE = {
     "benchmark": 580,
     "calibration": 1035,
     "capture": 832,
-    "cli": 1272,
+    "cli": 1270,
     "design": 1101,
     "diagnostics": 1839,
     "importers": 2098,
@@ -32,7 +32,7 @@ CODE = {
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25639,
+    "code": 25637,
     "classes": 333,
     "constants": 419,
     "Any": 177,

@@ -76,9 +76,7 @@ MODEL = Name("model", ("per_material", "hierarchical", "gp_spectral"))
 MATERIAL = Name("material", ("leaf", "fruit", "plastic", "coating", "glass", "water"), CaptureError)
 FIT_METHOD = Name("method", method_names(one=True), takes_calls=True)
 MANY_METHOD = Name("method", method_names(many=True), takes_calls=True)
-STUDY_METHOD = Name(
-    "method", (*(n for n in method_names(one=True) if n != "auto"), "nuts short", "nuts long")
-)
+STUDY_METHOD = Name("method", ("point", "laplace", "importance", "nuts short", "nuts", "nuts long"))
 
 
 @dataclasses.dataclass(frozen=True)
