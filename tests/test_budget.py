@@ -12,10 +12,10 @@ ROOT = Path(__file__).parents[1]
 CODE = {
     "benchmark": 580,
     "calibration": 1035,
-    "capture": 832,
+    "capture": 834,
     "cli": 1270,
     "design": 1101,
-    "diagnostics": 1839,
+    "diagnostics": 1838,
     "importers": 2098,
     "inference": 2722,
     "maps": 1705,
@@ -27,12 +27,12 @@ CODE = {
     "scenes": 1758,
     "own files": 1580,
     "models": 320,
-    "tests": 22804,
+    "tests": 22806,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25637,
+    "code": 25638,
     "classes": 333,
     "constants": 419,
     "Any": 177,

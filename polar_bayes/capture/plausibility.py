@@ -236,6 +236,10 @@ def at_mirror(capture: xr.Dataset, within: float = 2.5) -> xr.DataArray:
     return (apart <= within) & (sideways * np.sin(np.deg2rad(capture["view_zenith"])) <= within)
 
 
+def _signals(capture: xr.Dataset) -> list[str]:
+    return [name for name in ("dop", "q", "u", "intensity") if name in capture]
+
+
 def _valid(capture: xr.Dataset) -> xr.DataArray:
     return capture.get("valid", xr.DataArray(True))
 
@@ -378,14 +382,14 @@ def _ceiling_cautions(name: str, capture: xr.Dataset) -> Iterator[str]:
     """Caution against readings that stop at one value below full scale: a sensor's limit."""
     if {"y", "x"} & set(capture.dims):
         return
-    for signal in (each for each in ("dop", "q", "u", "intensity") if each in capture):
+    for signal in _signals(capture):
         readings = capture[signal].where(_valid(capture))
         limit = readings.attrs.get("saturation_level", math.inf) if signal == "intensity" else 1.0
-        by_color = readings.transpose("wavelength", ...) if "wavelength" in readings.dims else None
-        for color in [readings] if by_color is None else by_color:
+        is_spectral = "wavelength" in readings.dims
+        for color in readings.transpose("wavelength", ...) if is_spectral else [readings]:
             value, count = _ceiling(color.to_numpy())
             if count and value < 0.999 * limit:
-                wavelength = "" if by_color is None else f" at {float(color['wavelength']):g} nm"
+                wavelength = f" at {float(color['wavelength']):g} nm" if is_spectral else ""
                 yield (
                     f"The {count} largest readings of {signal}{wavelength}{name} are {value:.4g} "
                     "in every digit, and no others are so alike: a channel likely saturates there. "
@@ -408,7 +412,7 @@ def _ceiling(readings: np.ndarray) -> tuple[float, int]:
 
 
 def _readings_sentence(capture: xr.Dataset) -> str:
-    signals = [name for name in ("dop", "q", "u", "intensity") if name in capture]
+    signals = _signals(capture)
     errors = f"errors {capture.attrs.get('errors', 'stated')}"
     names = [f"{n} ({errors if f'{n}_error' in capture else 'no errors stated'})" for n in signals]
     zenith = capture["view_zenith"]

@@ -133,17 +133,16 @@ def _tails(noise: np.ndarray) -> tuple[float, float]:
     They are those of the Student t distribution with the median and the 95% quantile of its size.
     """
     half, most = np.quantile(np.abs(noise), [0.5, 0.95])
-
-    def excess(freedom: float) -> float:
-        ends = special.stdtrit(freedom, [0.75, 0.975])
-        return float(ends[1] / ends[0] - most / half)
-
     least, largest = LIMITS.freedom
     if not half > 0.0:
         return largest, 1.0
-    freedom = least if excess(least) < 0.0 else largest
-    if excess(least) > 0.0 > excess(largest):
-        freedom = float(optimize.brentq(excess, least, largest))
+
+    def ratio(freedom: float) -> float:
+        inner, outer = special.stdtrit(freedom, [0.75, 0.975])
+        return float(outer / inner)
+
+    observed = np.clip(most / half, ratio(largest), ratio(least))
+    freedom = float(optimize.brentq(lambda x: ratio(x) - observed, least, largest))
     scale = half / float(special.stdtrit(freedom, 0.75))
     return freedom, scale * math.sqrt((freedom + 3.0) / (freedom + 1.0))
 
