@@ -313,6 +313,9 @@ WRONG: dict[str, World] = {
     ),
     # What a set-up does, further off than it states.
     "frames with a tone curve": World("camera", change=counted(lambda light: light ** (1 / 2.2))),
+    "frames that are overexposed": World(
+        "camera", change=counted(lambda light: np.minimum(light, 0.3))
+    ),
     "a sensor that compresses": World("camera", change=counted(lambda light: light / (1 + light))),
     "a wall that gives back a tenth": World("camera", change=walled),
     "a wall that gives back a tenth, table": World("polarimeter", change=walled),

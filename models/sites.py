@@ -167,5 +167,5 @@ def declare_readings(
     with over_axes(data):
         for name, link in links.items():
             numpyro.deterministic(f"{name}_mean", link.center(name, prediction, noise))
-            likelihood = link.distribution(name, prediction, data, noise).mask(data.valid)
+            likelihood = link.distribution(name, prediction, data, noise).mask(data.fitted(name))
             numpyro.sample(name, likelihood, obs=link.reading(data.readings[name]))

@@ -201,13 +201,14 @@ def reading_information(
         jacobians, distributions = jax.jacfwd(noise, has_aux=True)(z)
     else:
         jacobians, distributions = _central_differences(noise, z, step)
-    valid, readings = data.valid[..., None, None], {}
+    readings = {}
     for name, distribution in distributions.items():
         of_noise, matrix = information(distribution)
         is_beta = isinstance(unwrapped(distribution), MeanConcentrationBeta)
+        is_fitted = data.fitted(name)[..., None, None]
         readings[name] = ReadingInformation(
-            jnp.where(valid, jacobians[name], 0.0),
-            jnp.where(valid, matrix, 0.0),
+            jnp.where(is_fitted, jacobians[name], 0.0),
+            jnp.where(is_fitted, matrix, 0.0),
             of_noise[1] if is_beta else None,
         )
     return readings

@@ -166,9 +166,11 @@ class ConditionalReparam(AbstractDensity[ConditionalInputs]):
         center = jnp.concatenate([jnp.ravel(prior.mean) for prior in priors])
         stiffness = 1.0 / jnp.concatenate([jnp.ravel(prior.variance) for prior in priors])
         precision, pull = jnp.diag(stiffness), stiffness * (center - start)
-        for slope, mean, variance, reading in zip(slopes, means, variances, readings, strict=True):
-            weight = jnp.where(given.data.valid, 1.0 / variance, 0.0)
-            residual = jnp.where(given.data.valid, reading - mean, 0.0)
+        parts = zip(program.observed, slopes, means, variances, readings, strict=True)
+        for name, slope, mean, variance, reading in parts:
+            is_fitted = given.data.fitted(name)
+            weight = jnp.where(is_fitted, 1.0 / variance, 0.0)
+            residual = jnp.where(is_fitted, reading - mean, 0.0)
             precision = precision + jnp.einsum("...i,...,...j->ij", slope, weight, slope)
             pull = pull + jnp.einsum("...i,...->i", slope, weight * residual)
         lower = jnp.linalg.cholesky(precision)

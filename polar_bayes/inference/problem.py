@@ -104,9 +104,9 @@ class Problem:
             rows[name] = [dims, int(np.prod(value.shape)), text, low, high]
         columns = ["dims", "size", "prior", "low", "high"]
         table = pd.DataFrame.from_dict(rows, orient="index", columns=columns)
-        valid = np.asarray(self.data.valid)[..., self.data.measured]
-        table.attrs["used"] = dict.fromkeys(program.observed, int(valid.sum()))
-        table.attrs["measured"] = dict.fromkeys(program.observed, valid.size)
+        fitted = {n: self.data.fitted(n)[..., self.data.measured] for n in program.observed}
+        table.attrs["used"] = {name: int(np.sum(each)) for name, each in fitted.items()}
+        table.attrs["measured"] = {name: each.size for name, each in fitted.items()}
         return table
 
     def log_density(
@@ -193,7 +193,9 @@ class Problem:
 def observe_request(request: Request, *, padded: bool = False) -> Observations:
     """Return the capture of a request as arrays in its precision."""
     limit = request.largest_view_zenith
-    data = observe(request.capture, largest_view_zenith=limit, padded=padded)
+    data = observe(
+        request.capture, largest_view_zenith=limit, padded=padded, described=request.links
+    )
     return data.in_single_precision() if request.precision == "single" else data
 
 

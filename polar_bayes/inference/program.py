@@ -245,10 +245,10 @@ class Program(AbstractDensity[Observations]):
         )
 
     def residuals(self, z: Float[Array, " size"], data: Observations) -> dict[str, Array]:
-        """Return readings minus noise-free readings of every observed site; 0 if not valid."""
+        """Return readings minus noise-free readings of every observed site; 0 if not fitted."""
         trace = self.trace(z, data)
         return {
-            name: jnp.where(data.valid, trace[name]["value"] - noise_free(trace, name), 0.0)
+            name: jnp.where(data.fitted(name), trace[name]["value"] - noise_free(trace, name), 0.0)
             for name in self.observed
         }
 

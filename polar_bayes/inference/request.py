@@ -129,7 +129,7 @@ def resolve(
     stated = {**usual, **own, **same}
     parts = ModelParts(function, setup.scene, stated, chosen)
     with jax.enable_x64(precision == "double"):
-        data = observe(capture, largest_view_zenith=limit, padded=parts.is_padded)
+        data = observe(capture, largest_view_zenith=limit, padded=parts.is_padded, described=chosen)
         with TRACING_LOCK:
             key = parts.key(layout_of(data))
             found = _MODEL_INFO.of(key, lambda: inspect_model(parts, data))

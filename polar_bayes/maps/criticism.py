@@ -247,11 +247,11 @@ class PixelCriticism:
             return None
         batch, modes = self._batch.subset(at), [np.float32(x[at]) for x in self._mode]
         found = batch.run(fitted_readings, batch.engine.program.observed, *modes, single=True)
-        valid = np.asarray(batch.pixels.batched.valid)
-        views, scores, changes = valid.shape[-1], [], []
-        for standard, jacobian in found.values():
-            if np.shape(jacobian)[:-1] == valid.shape:  # one number for each reading
-                e = np.where(valid, standard.scores(), np.nan)
+        data = batch.pixels.batched
+        views, scores, changes = data.valid.shape[-1], [], []
+        for name, (standard, jacobian) in found.items():
+            if np.shape(jacobian)[:-1] == data.valid.shape:  # one number for each reading
+                e = np.where(data.fitted(name), standard.scores(), np.nan)
                 scores.append(e.reshape(at.size, -1, views))
                 changes.append(jacobian.reshape(at.size, -1, views, jacobian.shape[-1]))
         if not scores:

@@ -154,7 +154,8 @@ class MapPlan:
     def observe(self, capture: xr.Dataset) -> Observations:
         """Return a block, or one pixel, as arrays."""
         limit, unit = self.request.largest_view_zenith, self.intensity_unit
-        data = observe(capture, largest_view_zenith=limit, intensity_unit=unit)
+        links = self.request.links
+        data = observe(capture, largest_view_zenith=limit, intensity_unit=unit, described=links)
         priors = jax.tree.map(jnp.asarray, as_priors(self.shared))
         return dataclasses.replace(data, shared=priors)
 

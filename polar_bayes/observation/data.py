@@ -4,6 +4,8 @@ Labels are dropped here and restored in `polar_bayes.inference.result`. Missing 
 placeholders with `valid=False`, so that every shape is static and no entry is dropped.
 """
 
+from collections.abc import Collection
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -28,7 +30,8 @@ class Observations(eqx.Module):
         full_scale: Where the sensor saturates, in the unit of `readings["intensity"]`.
         intensity_unit: What an intensity reading of 1 is in the capture's own unit.
         valid: False where a view is missing or set aside.
-        saturated: True where the reading is censored at full scale.
+        saturated: True where the intensity is censored at full scale; the polarization of such a
+            view comes from frames that are full, and does not count.
         dims: Names and lengths of all axes, outermost first, ending with the view.
         confidence: Confidence in the stated normal, in (0, 1], which broadcasts with the readings;
             None where the capture states none.
@@ -66,6 +69,10 @@ class Observations(eqx.Module):
         """Names and lengths of the axes of materials, patches or pixels."""
         return tuple(axis for axis in self.dims if axis[0] not in ("wavelength", "view"))
 
+    def fitted(self, name: str) -> Bool[Array, "... view"]:
+        """Which readings of a variable count; saturated frames do not tell the polarization."""
+        return self.valid if name == "intensity" else self.valid & ~self.saturated
+
     @property
     def measured(self) -> slice:
         """The views of the capture, along the last axis."""
@@ -89,8 +96,12 @@ def observe(
     largest_view_zenith: float = 90.0,
     intensity_unit: float | None = None,
     padded: bool = False,
+    described: Collection[str] = READINGS,
 ) -> Observations:
-    """Convert a validated capture to arrays, padded to `padded_length` on request."""
+    """Convert a validated capture to arrays, padded to `padded_length` on request.
+
+    A saturated view is not valid unless the intensity is among the `described` variables.
+    """
     views = capture.sizes["view"]
     if padded:  # by the last view again, whose directions are possible ones
         capture = capture.isel(view=np.minimum(np.arange(padded_length(views)), views - 1))
@@ -103,6 +114,7 @@ def observe(
     saturated = np.asarray(_values(capture, "saturated", order, default=False), bool)
     if np.isfinite(full_scale):  # a reading at full scale is censored, flagged or not
         saturated = saturated | (_values(capture, "intensity", order) >= full_scale)
+    valid = valid if "intensity" in described else valid & ~saturated
     shape = np.broadcast_shapes(
         valid.shape, *(_values(capture, name, order).shape for name in names)
     )

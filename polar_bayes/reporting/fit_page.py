@@ -639,8 +639,8 @@ def _counts(counts: Provenance) -> dict[str, Any]:
     found |= {"masked (valid=False)": counts.get("masked")}
     if None not in found.values():
         aside = counts["views"] - counts["masked"] - counts["used"]
-        found["set aside (beyond the angle limit)"] = aside
-    found["saturated"] = counts.get("saturated")
+        found["set aside (beyond the angle limit, or full frames)"] = aside
+    found["saturated (polarization not fitted)"] = counts.get("saturated")
     margin = counts.get("at_margin") or {}
     found |= {f"{name} at the margin of its link": count for name, count in margin.items()}
     return {name: count for name, count in found.items() if count is not None}

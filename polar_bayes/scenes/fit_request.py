@@ -203,7 +203,7 @@ def _provenance(request: Request, method: AbstractMethod, problem: Problem) -> P
     """Return everything that is needed to repeat the fit."""
     data = problem.data
     at_boundary = {
-        name: int(np.sum((np.asarray(link.reading(x)) != x) & np.asarray(data.valid)))
+        name: int(np.sum((np.asarray(link.reading(x)) != x) & np.asarray(data.fitted(name))))
         for name, link in request.links.items()
         for x in [np.asarray(data.readings[name])]
     }

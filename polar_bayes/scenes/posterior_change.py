@@ -264,14 +264,14 @@ class Baseline:
         return PosteriorChange(found, largest, rms, shift, sd_ratio)
 
     def _moves(self, other: SceneDensity, start: np.ndarray) -> np.ndarray:
-        """Return changes of predictions of valid readings in units of their noise."""
+        """Return changes of predictions of fitted readings in units of their noise."""
         # A sensor far beyond its full scale has no noise, and what it records does not move.
         before, after = self.fit.density.noise_free(self.fit.z), other.noise_free(start)
-        valid = np.asarray(self.fit.density.data.valid)
         rows = []
         for name, sd in self.noise_sd.items():
             move = np.where(sd > 0.0, after[name] - before[name], 0.0) / np.where(sd > 0.0, sd, 1.0)
-            rows.append(np.broadcast_to(move, valid.shape)[valid])
+            is_fitted = np.asarray(self.fit.density.data.fitted(name))
+            rows.append(np.broadcast_to(move, is_fitted.shape)[is_fitted])
         return np.concatenate(rows)
 
     def largest_change(self, change: PosteriorChange) -> float:
