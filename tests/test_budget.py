@@ -17,9 +17,9 @@ CODE = {
     "design": 1102,
     "diagnostics": 1838,
     "importers": 2098,
-    "inference": 2726,
+    "inference": 2733,
     "maps": 1706,
-    "methods": 1267,
+    "methods": 1265,
     "numerics": 997,
     "observation": 511,
     "physics": 2756,
@@ -27,12 +27,12 @@ CODE = {
     "scenes": 1758,
     "own files": 1580,
     "models": 320,
-    "tests": 22821,
+    "tests": 22824,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25650,
+    "code": 25655,
     "classes": 333,
     "constants": 419,
     "Any": 177,

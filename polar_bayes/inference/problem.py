@@ -13,11 +13,11 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Array, ArrayLike, Float
 
-from polar_bayes.errors import FitError
+from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.inference.compiled_model import CompiledModel, compile_model
 from polar_bayes.inference.initialization import AbstractInit
 from polar_bayes.inference.program import Draw, Program, Values, in_blocks, keys_of_draws
-from polar_bayes.inference.request import Request
+from polar_bayes.inference.request import MIN_VIEWS, Request
 from polar_bayes.numerics.compile import TRACING_LOCK
 from polar_bayes.observation.data import Observations, observe
 from polar_bayes.priors import RANGES, describe_prior, support_bounds
@@ -191,11 +191,22 @@ class Problem:
 
 
 def observe_request(request: Request, *, padded: bool = False) -> Observations:
-    """Return the capture of a request as arrays in its precision."""
+    """Return the capture of a request as arrays in its precision.
+
+    A `CaptureError` where too few views are left, since a saturated one does not count without its
+    intensity.
+    """
     limit = request.largest_view_zenith
     data = observe(
         request.capture, largest_view_zenith=limit, padded=padded, described=request.links
     )
+    left = int(np.any(data.valid, axis=tuple(range(data.valid.ndim - 1))).sum())
+    if left < MIN_VIEWS:
+        raise CaptureError(
+            f"only {left} of its views are not saturated, and no link describes the intensity",
+            where=f"{request.capture.attrs.get('name', 'capture')}: view",
+            hint="expose shorter, or fit the intensity, too",
+        )
     return data.in_single_precision() if request.precision == "single" else data
 
 

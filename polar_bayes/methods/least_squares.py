@@ -72,16 +72,15 @@ class Estimate(NamedTuple):
 
 def estimate(program: Program, data: Observations, starts: Float[Array, "start size"]) -> Estimate:
     """Run Levenberg-Marquardt from several starts, and re-estimate the scatter after one pass."""
+    counts = jnp.stack([jnp.sum(data.fitted(name)) for name in program.observed])
 
     def residuals(z: Array, unit: Array) -> Array:
         parts = program.residuals(z, data)
         return jnp.concatenate([(parts[n] / unit[i]).ravel() for i, n in enumerate(parts)])
 
     def scatter(z: Array) -> Array:
-        parts = program.residuals(z, data)
-        counts = [jnp.maximum(jnp.sum(data.fitted(name)), 1) for name in parts]
-        squares = [jnp.sum(part**2) for part in parts.values()]
-        return jnp.sqrt(jnp.stack(squares) / jnp.stack(counts)) + 1e-6
+        squares = [jnp.sum(part**2) for part in program.residuals(z, data).values()]
+        return jnp.sqrt(jnp.stack(squares) / jnp.maximum(counts, 1)) + 1e-6
 
     def soften(z: Array, unit: Array) -> Array:
         # (sqrt(1 + r^2) - 1) = soft L1; its signed square root keeps the derivative at 0.
@@ -105,8 +104,7 @@ def estimate(program: Program, data: Observations, starts: Float[Array, "start s
     unit = scatter(z)
     jacobian = jax.jacfwd(lambda x: soften(x, unit))(z)
     values, vectors = jnp.linalg.eigh(jacobian.T @ jacobian)
-    count = sum(jnp.sum(data.fitted(name)) for name in program.observed)
-    freedom = jnp.maximum(count - program.size, 1)
+    freedom = jnp.maximum(jnp.sum(counts) - program.size, 1)
     variance = jnp.sum(soften(z, unit) ** 2) / freedom
     inverse = jnp.where(values > 1e-10 * values[-1], variance / values, jnp.inf)
     unknown = jnp.isinf(inverse)
