@@ -26,6 +26,7 @@ from polar_bayes.diagnostics.parameters import (
     Scalar,
     with_entries,
 )
+from polar_bayes.diagnostics.sensitivity import determination_sentences
 from polar_bayes.diagnostics.view import FitView, Provenance, once, view_of
 from polar_bayes.inference.result import CENTRAL_95, bounds_of
 from polar_bayes.numerics.mcse import LARGEST_R_HAT, SMALLEST_ESS, TAILS
@@ -112,6 +113,7 @@ def verdict(fit: FitView) -> Verdict:
         *_chain_notes(fit),
         *_edges(provenance.get("counts", {}), many=False),
         *budget_sentences(fit),
+        *(() if problems or faults else determination_sentences(fit)),
     )
     made, missing = checks_made(method, criticism)
     return Verdict(

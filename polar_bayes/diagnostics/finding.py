@@ -37,7 +37,7 @@ def p_text(p_value: float) -> str:
 
 def join(names: Sequence[str]) -> str:
     """Join texts as `a, b and c`."""
-    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+    return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
 
 def listed(items: Iterable[str], most: int = 4) -> str:

@@ -13,7 +13,8 @@ Source: Kallioinen et al. (2024), Statistics and Computing 34, 57 (power scaling
 """
 
 import math
-from collections.abc import Collection
+from collections import Counter
+from collections.abc import Collection, Iterator
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ import pandas as pd
 import xarray as xr
 from arviz_stats.base import array_stats
 
+from polar_bayes.diagnostics.finding import join
 from polar_bayes.diagnostics.limits import LIMITS
 from polar_bayes.diagnostics.parameters import MIN_DRAWS, SAMPLE_DIMS
 from polar_bayes.diagnostics.residuals import readings_alone, residuals_of
@@ -69,6 +71,31 @@ def _compare(prior: np.ndarray | None, posterior: np.ndarray) -> list[Any]:
     if inside <= LIMITS.partly:
         verdict = "determined" if inside <= LIMITS.determined else "partly"
     return [*ends, inside, (high - low) / prior_width, contraction, verdict]
+
+
+def determination_sentences(fit: FitView) -> Iterator[str]:
+    """Name the material parameters that the data determine in part or not, and what would help."""
+    material = [scalar for scalar in fit.scalars if scalar.is_material and fit.method != "point"]
+    found: dict[str, Counter[str]] = {"partly": Counter(), "not determined": Counter()}
+    for scalar in material:
+        prior = fit.prior.get(scalar.label)
+        judged = _compare(None if prior is None else prior.draws, scalar.draws)[-1]
+        found.get(judged, Counter())[scalar.name] += 1
+    total = Counter(scalar.name for scalar in material)
+    names = {
+        verdict: join([n if k == total[n] else f"{n} ({k} of {total[n]})" for n, k in each.items()])
+        for verdict, each in found.items()
+    }
+    if partly := names["partly"]:
+        yield f"The data determine only in part: {partly}. There the prior still matters."
+    if undetermined := names["not determined"]:
+        yield (
+            f"The data do not determine {undetermined}. There the interval is mostly the prior's: "
+            "do not quote it as a measurement."
+        )
+    full = fit.provenance.get("counts", {}).get("saturated")
+    if full and any(names.values()):
+        yield f"Saturated readings: {full}. They tell little, so a shorter exposure may tell more."
 
 
 def _interval(draws: np.ndarray) -> tuple[float, float]:

@@ -219,23 +219,12 @@ def swapped_sentence(provenance: Provenance) -> str:
 
 
 def determined(fit: FitView) -> list[str]:
-    """State which material parameters the data determine; empty for a failed fit."""
+    """Name the material parameters that the data determine; the verdict names the others."""
     if not convergence.verdict(fit).passed:
         return []
-    judgement = sensitivity(fit)["verdict"]
-    phrases = {
-        "determined": "The data determine {}.",
-        "partly": "The data determine only in part: {}. There the prior still matters.",
-        "not determined": "The data do not determine {}. There the interval is mostly the prior's: "
-        "do not quote it as a measurement.",
-    }
-    sentences = []
-    for judged, phrase in phrases.items():
-        found = judgement.index[judgement == judged]
-        group = [scalar for scalar in fit.scalars if scalar.is_material and scalar.label in found]
-        if group:
-            sentences.append(phrase.format(parameter_names(group, fit.posterior)))
-    return sentences
+    found = sensitivity(fit)["verdict"]
+    group = [x for x in fit.scalars if x.is_material and found.get(x.label) == "determined"]
+    return [f"The data determine {parameter_names(group, fit.posterior)}."] if group else []
 
 
 def between_members(fit: FitView) -> list[str]:
