@@ -441,17 +441,18 @@ def _record(
     key_intensity, key_rest = jax.random.split(jax.random.key(seed))
     axes = len(layout.shape)
     parameters = {name: _align_image(x, axes - 1) for name, x in truth.items()}
-    prediction = scene.predict(parameters, layout.geometry)
-    prediction = {n: jnp.broadcast_to(x, layout.shape) for n, x in prediction.items()}
-    light = prediction["intensity"]
+    alone = scene.predict(parameters | {"exposure": jnp.inf}, layout.geometry)  # no ambient light
+    light = jnp.broadcast_to(alone["intensity"], layout.shape)
     # Outside its highlight a bare mirror is black: no camera exposes for what is left of a lobe
     # there, so that the brightest view sets the exposure if its contrast is larger than 1e4.
     bright = jnp.maximum(jnp.quantile(light, BRIGHT_QUANTILE), jnp.max(light) / 1e4)
     exposure = BRIGHT_LEVEL / bright
-    levels = {
-        name: exposure if level is None else _align_image(level, axes)
-        for name, level in noise.items()
-    }
+    chosen = {name: exposure if level is None else level for name, level in noise.items()}
+    levels = {name: _align_image(level, axes) for name, level in chosen.items()}
+    if "exposure" in chosen:
+        parameters["exposure"] = _align_image(chosen["exposure"], axes - 1)
+    prediction = scene.predict(parameters, layout.geometry)
+    prediction = {n: jnp.broadcast_to(x, layout.shape) for n, x in prediction.items()}
     recorded: dict[str, Array] = {}
     data = layout
     if "intensity" in links:

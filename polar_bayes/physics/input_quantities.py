@@ -148,13 +148,16 @@ class PolarizationLoss(AbstractInputQuantity):
 
 @dataclasses.dataclass(frozen=True)
 class AmbientLight(AbstractInputQuantity):
-    """Unpolarized ambient light, as a share of the brightest reading, in every view."""
+    """Unpolarized ambient light, as a share of the brightest reading, in every view.
+
+    No reading is brighter than full scale, whatever light a saturated highlight sends.
+    """
 
     name = "ambient_light"
 
     @override
     def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
-        level = self.offset(parameters) * jnp.max(light.intensity, axis=-1, keepdims=True)
+        level = self.offset(parameters) * _brightest(parameters, light)
         return DarkLevel().record({"dark_level": level}, geometry, light)
 
 
@@ -167,10 +170,16 @@ class ToneCurve(AbstractInputQuantity):
     @override
     def record(self, parameters: Parameters, geometry: Geometry, light: Light) -> Light:
         offset = self.offset(parameters)
-        brightest = jnp.max(light.intensity, axis=-1, keepdims=True)
+        brightest = _brightest(parameters, light)
         share = light.intensity / jnp.where(brightest > 0.0, brightest, 1.0)
         kept = jnp.exp(offset * jnp.log(at_least(share, STRAY)))
         return Light(kept * light.intensity, _bent(light.q, offset), _bent(light.u, offset))
+
+
+def _brightest(parameters: Parameters, light: Light) -> Array:
+    """Return the light of the brightest reading, at most what fills a sensor of known exposure."""
+    most = jnp.max(light.intensity, axis=-1, keepdims=True)
+    return jnp.minimum(most, 1.0 / parameters["exposure"]) if "exposure" in parameters else most
 
 
 def _bent(contrast: Array, offset: Array) -> Array:

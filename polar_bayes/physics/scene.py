@@ -168,7 +168,8 @@ class Scene(HTMLRepr):
 
         Args:
             parameters: Material and instrument parameters by name. Shape (...);
-                `discrepancy_weights` has a trailing axis over its basis.
+                `discrepancy_weights` has a trailing axis over its basis. With `exposure`, recorded
+                over predicted intensity, no reading is brighter than a full scale of 1.
             geometry: Directions as read off. Shape (..., view), degree.
 
         Returns:
@@ -177,7 +178,8 @@ class Scene(HTMLRepr):
         Raises:
             SceneError: A parameter that the scene reads is missing.
         """
-        per_view = self._per_view(parameters, self.parameters, geometry)
+        names = *self.parameters, *(("exposure",) if "exposure" in parameters else ())
+        per_view = self._per_view(parameters, names, geometry)
         if self.instrument is None:
             light = self._optics(per_view, geometry)
         else:
@@ -286,15 +288,14 @@ class Scene(HTMLRepr):
     ) -> dict[str, Array]:
         """Return the scene's parameters in one precision, each with a trailing view axis."""
         # A Python number takes the precision of the arrays beside it.
-        needed = [name for name in self.parameters if name in names]
         # Who does not know of an input quantity, such as a model of the user's own, has none.
         parameters = {**self._neutral_quantities(), **parameters}
-        missing = [name for name in needed if name not in parameters]
+        missing = [name for name in names if name not in parameters]
         if missing:
-            hint = f"this scene reads {', '.join(needed)}"
+            hint = f"this scene reads {', '.join(names)}"
             raise SceneError(f"{', '.join(missing)} missing", where="parameters", hint=hint)
-        dtype = jnp.result_type(geometry.dtype, *(parameters[name] for name in needed))
-        return {name: jnp.asarray(parameters[name], dtype)[..., None] for name in needed}
+        dtype = jnp.result_type(geometry.dtype, *(parameters[name] for name in names))
+        return {name: jnp.asarray(parameters[name], dtype)[..., None] for name in names}
 
 
 def _computed_once[T](values: T) -> T:

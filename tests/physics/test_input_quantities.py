@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import xarray as xr
 from cases import each
 
 import polar_bayes as pb
@@ -21,6 +22,7 @@ from polar_bayes.physics.input_quantities import (
 )
 from polar_bayes.physics.stokes import Light
 from polar_bayes.setups import SETUPS
+from polar_bayes.simulation import Protocol
 
 GEOMETRY = Geometry(
     jnp.array([0.0, 30.0, 60.0]), jnp.array([180.0, 180.0, 0.0]), jnp.full(3, 40.0), jnp.zeros(3)
@@ -139,3 +141,40 @@ def test_a_scene_that_is_given_no_offset_has_none() -> None:
     with_offsets, without = predict(setup.scene.known_to(setup.known)), predict(setup.scene)
     for name, reading in without.items():
         np.testing.assert_allclose(with_offsets[name], reading, rtol=1e-12, atol=1e-15)
+
+
+def test_ambient_light_is_a_share_of_what_a_sensor_can_record() -> None:
+    """A highlight a thousand times too bright does not make ambient light brighter than a body."""
+    bright = LIGHT._replace(intensity=LIGHT.intensity.at[0].set(1000.0))
+
+    def added(exposure: float | None) -> np.ndarray:
+        given = offset(AmbientLight(), 0.01)
+        if exposure is not None:
+            given["exposure"] = jnp.array([exposure])
+        lit = AmbientLight().record(given, GEOMETRY, bright).intensity
+        return np.asarray(lit - bright.intensity)
+
+    np.testing.assert_allclose(added(2.0), 0.01 / 2.0, rtol=1e-10)  # full scale is 1 / exposure
+    np.testing.assert_allclose(added(None), 0.01 * 1000.0, rtol=1e-10)
+    np.testing.assert_allclose(added(0.6 / 1000.0), 0.01 * 1000.0, rtol=1e-10)  # nothing is full
+
+
+def test_an_overexposed_highlight_leaves_the_rest_of_a_capture_as_it_was() -> None:
+    """Polarization of the body of a polished plate, with ambient light and without."""
+
+    def simulated(ambient: float) -> xr.Dataset:
+        camera = SETUPS["camera"]
+        capture = pb.simulate(
+            "glass",
+            scene=camera.scene.known_to(camera.known),
+            links=camera.links,
+            protocol=Protocol(views=40, wavelengths=()),
+            parameters={"roughness": 0.02, "ambient_light_offset": ambient},
+            noise={"stokes_scale": 1e-6, "intensity_scale": 1e-6, "exposure": 20.0},
+        )
+        assert capture["saturated"].any()
+        return capture.where(~capture["saturated"] & (abs(capture["q"]) > 0.01), drop=True)
+
+    lit, dark = simulated(0.003), simulated(0.0)
+    share = (1.0 - lit["q"] / dark["q"]) * lit["intensity"]  # of full scale
+    np.testing.assert_allclose(share, 0.003, rtol=0.02)  # the noise is up to 1e-4 of q
