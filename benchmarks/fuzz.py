@@ -48,13 +48,13 @@ from mutations import (
     assert_inside_contract,
     damage_text,
     mutate,
+    mutate_tree,
     pick,
     table_text,
 )
 from plate_images import ASKED, plate_image
 from plates import plate_capture
 from synthetic_results import make_result
-from tree_mutations import mutate as mutate_tree
 
 from polar_bayes.cli import main as command
 

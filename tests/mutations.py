@@ -1,5 +1,6 @@
-"""Damaged captures and tables: mutations by a seed, and the contract that they may break."""
+"""Damaged captures, results and tables: mutations by a seed, and the contract they may break."""
 
+import json
 import math
 
 import numpy as np
@@ -20,7 +21,11 @@ ODD_ATTRIBUTES = [
     None, True, 3, 10**30, math.nan, math.inf, "radian", "", "two\nlines", "\0", "\ud800",
     b"\xff", (), [1, 2], ["a"], [[1], [1, 2]], {"a": 1}, np.arange(3), np.array("x"),
     np.float32(0.1), np.bool_(True), np.datetime64("2020-01-01"), 1j, object(), print,
-    np.array([None]),
+    np.array([None]), "not JSON", "[1]", "{", "[" * 5000,
+]  # fmt: skip
+ODD_JSON = [
+    None, True, -1, 10**30, 0.5, math.nan, math.inf, "", "two\nlines", "<b>", [], [1], ["a", None],
+    [[1, 2]], {}, {"a": 1}, {"": [None]},
 ]  # fmt: skip
 ODD_TYPES = ["U3", "S3", "object", "complex64", "bool", "M8[ns]", "m8[ns]", "int8", "uint64"]
 ODD_TYPES += ["float16", "float32", "longdouble"]
@@ -96,7 +101,7 @@ def widen(capture, random):
 def annotate(capture, random):
     capture = capture.copy()
     owner = capture if random.random() < 0.3 else capture[any_variable(capture, random)]
-    names = ["units", "saturation_level", "name", "long_name", *ODD_NAMES]
+    names = ["units", "saturation_level", "name", "long_name", *owner.attrs, *ODD_NAMES]
     owner.attrs[pick(random, names)] = pick(random, ODD_ATTRIBUTES)
     return capture
 
@@ -120,13 +125,65 @@ MUTATIONS = (
 
 def mutate(capture, random):
     """Make one to three mutations; those that xarray itself refuses are left out."""
-    for _ in range(random.integers(1, 4)):
-        mutation = pick(random, MUTATIONS)
+    return _mutated(capture, random, MUTATIONS, random.integers(1, 4))
+
+
+def _mutated(data, random, mutations, count):
+    for _ in range(count):
         try:
-            capture = mutation(capture, random)
-        except (ValueError, TypeError, KeyError, IndexError, UnicodeError, OverflowError):
+            data = pick(random, mutations)(data, random)
+        except (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError):
             continue
-    return capture
+    return data
+
+
+# --- mutations of a result: each takes a tree and gives another -------------------------------
+
+
+def edit_group(tree, random):
+    name = pick(random, sorted(tree.children))
+    changed = pick(random, MUTATIONS)(tree[name].to_dataset(), random)
+    return tree.assign({name: xr.DataTree(changed)})
+
+
+def drop_group(tree, random):
+    name = pick(random, sorted(tree.children))
+    return tree.filter(lambda node: node.name != name)
+
+
+def swap_groups(tree, random):
+    one, other = (pick(random, sorted(tree.children)) for _ in range(2))
+    return tree.assign({one: xr.DataTree(tree[other].to_dataset())})
+
+
+def edit_provenance(tree, random):
+    whole = place = json.loads(tree.attrs["polar_bayes"])
+    while True:
+        key = pick(random, sorted(place) if isinstance(place, dict) else range(len(place)))
+        inner = place[key]
+        if not isinstance(inner, dict | list) or not inner or random.random() < 0.5:
+            break
+        place = inner
+    if random.random() < 0.3:
+        del place[key]
+    else:
+        place[key] = pick(random, ODD_JSON)
+    return tree.copy().assign_attrs(polar_bayes=json.dumps(whole))
+
+
+def annotate_tree(tree, random):
+    return tree.copy().assign_attrs(polar_bayes=pick(random, ODD_ATTRIBUTES))
+
+
+TREE_MUTATIONS = (
+    edit_provenance, edit_provenance, edit_provenance, annotate_tree, drop_group, swap_groups,
+    *(edit_group,) * 8,
+)  # fmt: skip
+
+
+def mutate_tree(tree, random):
+    """Make one or two mutations of a result; those that xarray itself refuses are left out."""
+    return _mutated(tree, random, TREE_MUTATIONS, random.integers(1, 3))
 
 
 def assert_inside_contract(capture):

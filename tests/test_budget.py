@@ -11,28 +11,28 @@ ROOT = Path(__file__).parents[1]
 
 CODE = {
     "benchmark": 580,
-    "calibration": 1035,
+    "calibration": 1038,
     "capture": 834,
     "cli": 1270,
     "design": 1102,
-    "diagnostics": 1861,
+    "diagnostics": 1862,
     "importers": 2098,
     "inference": 2733,
     "maps": 1706,
     "methods": 1265,
     "numerics": 997,
     "observation": 511,
-    "physics": 2759,
+    "physics": 2760,
     "reporting": 3261,
     "scenes": 1758,
     "own files": 1581,
     "models": 321,
-    "tests": 22851,
+    "tests": 22787,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25672,
+    "code": 25677,
     "classes": 333,
     "constants": 419,
     "Any": 177,

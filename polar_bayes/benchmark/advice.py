@@ -161,7 +161,7 @@ def accuracy_sentences(result: Study, tolerance: float = 0.1) -> list[str]:
 
 def _advice(table: pd.DataFrame, errors: pd.DataFrame, tolerance: float) -> str:
     seconds = table[time_column(table)]
-    known = table["error"].notna() & seconds.notna()
+    known = table["error"].notna() & (seconds > 0.0)
     if not known.any():
         return "No method has an answer here."
     good = known & (table["error"] <= tolerance)
@@ -177,7 +177,7 @@ def _advice(table: pd.DataFrame, errors: pd.DataFrame, tolerance: float) -> str:
     if partly is not None:
         quick, missed = partly
         rest = float(errors.loc[quick].drop(missed).max())
-        times = seconds[fastest] / seconds[quick]
+        times = float(seconds[fastest]) / float(seconds[quick])
         return (
             f"{quick} is within {rest:.2g} sd here and {times:.2g} times faster than {fastest}, "
             f"but for {join(missed)}; use {fastest} for {'it' if len(missed) == 1 else 'them'}."
@@ -186,7 +186,7 @@ def _advice(table: pd.DataFrame, errors: pd.DataFrame, tolerance: float) -> str:
     slower = table[good & table.index.str.startswith("nuts") & (seconds > seconds[fastest])]
     if len(slower):
         other = str(seconds[slower.index].idxmin())
-        times = seconds[other] / seconds[fastest]
+        times = float(seconds[other]) / float(seconds[fastest])
         # Times differ by a fifth from run to run.
         faster = f"{times:.2g} times faster than" if times >= 1.2 else "as fast as"
         said += f" and {faster} {other}"

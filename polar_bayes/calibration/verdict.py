@@ -171,7 +171,8 @@ def _parameter_row(scalar: Scalar, truth: np.ndarray, marginals: xr.Dataset) -> 
         f"p_held_{percent}": coverage_p_value(hits, int(columns["answered"]), percent / 100.0)
         for percent, hits in held.items()
     }
-    means = {"width_95": high - low, "crps": own[f"{scalar.name}_crps"].to_numpy()}
+    with np.errstate(invalid="ignore"):  # of infinite ends
+        means = {"width_95": high - low, "crps": own[f"{scalar.name}_crps"].to_numpy()}
     return {
         **columns,
         **coverage_columns(held, pit.size),
@@ -479,7 +480,8 @@ def _score_change(
     if both.sum() < 2 or not base[both].mean() > 0.0:
         return math.nan, math.nan
     score, base = score[both], base[both]
-    ratio = score.mean() / base.mean()
-    # Standard error of the ratio of two correlated means, by the delta method.
-    error = np.std(score - ratio * base, ddof=1) / (base.mean() * math.sqrt(both.sum()))
+    with np.errstate(over="ignore", invalid="ignore"):  # by a score near zero
+        ratio = score.mean() / base.mean()
+        # Standard error of the ratio of two correlated means, by the delta method.
+        error = np.std(score - ratio * base, ddof=1) / (base.mean() * math.sqrt(both.sum()))
     return float(ratio - 1.0), float(error)

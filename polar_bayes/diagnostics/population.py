@@ -61,14 +61,14 @@ class Population:
     def from_scale(self, value: np.ndarray) -> np.ndarray:
         """Back to the unit of the parameter."""
         scales = {"log": np.exp, "log odds": scipy.special.expit, "plain": np.asarray}
-        return scales[self.scale](value)
+        with np.errstate(over="ignore"):
+            return scales[self.scale](value)
 
     def differences(self) -> np.ndarray:
         """Return draws of the spread in the parameter's unit; a factor on the log scale."""
         location, spread = self.location.draws.ravel(), self.spread.draws.ravel()
         if self.scale == "log":
-            with np.errstate(over="ignore"):
-                return np.exp(spread)
+            return self.from_scale(spread)
         # Near the location a unit of log odds is worth location (1 - location).
         return location * (1.0 - location) * spread if self.scale == "log odds" else spread
 

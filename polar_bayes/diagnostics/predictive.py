@@ -198,7 +198,8 @@ def _relative_ess(fit: FitView) -> float:
     if fit.method != "nuts":
         return 1.0
     draws = np.stack([s.draws for s in fit.scalars])
-    draws = draws[np.isfinite(draws).all(axis=(1, 2)) & (np.ptp(draws, axis=(1, 2)) > 0.0)]
+    draws = draws[np.isfinite(draws).all(axis=(1, 2))]
+    draws = draws[np.ptp(draws, axis=(1, 2)) > 0.0]
     if not len(draws) or draws[0].size < MIN_DRAWS:
         return 1.0
     return float(np.mean(array_stats.ess(draws, method="mean", relative=True)))

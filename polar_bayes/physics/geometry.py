@@ -150,7 +150,8 @@ def double_angle(cos: Array, sin: Array) -> tuple[Array, Array]:
 
 def unit_vectors(directions: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "... 3"]:
     """Unit vectors of directions: zenith and azimuth, unit degree."""
-    zenith, azimuth = np.moveaxis(np.radians(directions), -1, 0)
+    finite = np.where(np.isfinite(directions), directions, np.nan)
+    zenith, azimuth = np.moveaxis(np.radians(finite), -1, 0)
     sine = np.sin(zenith)
     return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=-1)
 
