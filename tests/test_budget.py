@@ -17,7 +17,7 @@ CODE = {
     "design": 1102,
     "diagnostics": 1862,
     "importers": 2098,
-    "inference": 2733,
+    "inference": 2735,
     "maps": 1706,
     "methods": 1265,
     "numerics": 997,
@@ -27,12 +27,12 @@ CODE = {
     "scenes": 1758,
     "own files": 1581,
     "models": 321,
-    "tests": 22787,
+    "tests": 22794,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25677,
+    "code": 25679,
     "classes": 333,
     "constants": 419,
     "Any": 177,

@@ -104,7 +104,8 @@ class Problem:
             rows[name] = [dims, int(np.prod(value.shape)), text, low, high]
         columns = ["dims", "size", "prior", "low", "high"]
         table = pd.DataFrame.from_dict(rows, orient="index", columns=columns)
-        fitted = {n: self.data.fitted(n)[..., self.data.measured] for n in program.observed}
+        data = jax.device_get(self.data)  # on the host, where nothing compiles
+        fitted = {n: data.fitted(n)[..., data.measured] for n in program.observed}
         table.attrs["used"] = {name: int(np.sum(each)) for name, each in fitted.items()}
         table.attrs["measured"] = {name: each.size for name, each in fitted.items()}
         return table
@@ -200,7 +201,8 @@ def observe_request(request: Request, *, padded: bool = False) -> Observations:
     data = observe(
         request.capture, largest_view_zenith=limit, padded=padded, described=request.links
     )
-    left = int(np.any(data.valid, axis=tuple(range(data.valid.ndim - 1))).sum())
+    valid = np.asarray(data.valid)  # on the host, where nothing compiles
+    left = int(np.any(valid, axis=tuple(range(valid.ndim - 1))).sum())
     if left < MIN_VIEWS:
         raise CaptureError(
             f"only {left} of its views are not saturated, and no link describes the intensity",

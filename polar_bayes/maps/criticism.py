@@ -10,6 +10,7 @@ import enum
 import math
 from collections.abc import Iterator, Mapping
 
+import jax
 import numpy as np
 from numpy.typing import ArrayLike
 from numpyro import distributions as dist
@@ -247,7 +248,7 @@ class PixelCriticism:
             return None
         batch, modes = self._batch.subset(at), [np.float32(x[at]) for x in self._mode]
         found = batch.run(fitted_readings, batch.engine.program.observed, *modes, single=True)
-        data = batch.pixels.batched
+        data = jax.device_get(batch.pixels.batched)
         views, scores, changes = data.valid.shape[-1], [], []
         for name, (standard, jacobian) in found.items():
             if np.shape(jacobian)[:-1] == data.valid.shape:  # one number for each reading

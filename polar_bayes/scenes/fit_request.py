@@ -201,9 +201,9 @@ def _indices_by_eye(request: Request) -> dict[str, list[float]]:
 
 def _provenance(request: Request, method: AbstractMethod, problem: Problem) -> Provenance:
     """Return everything that is needed to repeat the fit."""
-    data = problem.data
+    data = jax.device_get(problem.data)
     at_boundary = {
-        name: int(np.sum((np.asarray(link.reading(x)) != x) & np.asarray(data.fitted(name))))
+        name: int(np.sum((np.asarray(link.reading(x)) != x) & data.fitted(name)))
         for name, link in request.links.items()
         for x in [np.asarray(data.readings[name])]
     }

@@ -267,10 +267,10 @@ class Baseline:
         """Return changes of predictions of fitted readings in units of their noise."""
         # A sensor far beyond its full scale has no noise, and what it records does not move.
         before, after = self.fit.density.noise_free(self.fit.z), other.noise_free(start)
-        rows = []
+        data, rows = jax.device_get(self.fit.density.data), []
         for name, sd in self.noise_sd.items():
             move = np.where(sd > 0.0, after[name] - before[name], 0.0) / np.where(sd > 0.0, sd, 1.0)
-            is_fitted = np.asarray(self.fit.density.data.fitted(name))
+            is_fitted = data.fitted(name)
             rows.append(np.broadcast_to(move, is_fitted.shape)[is_fitted])
         return np.concatenate(rows)
 
