@@ -536,7 +536,7 @@ _ROWS: dict[str, dist.Distribution] = {
     "normal_scale": dist.LogNormal(math.log(0.03), 1.0),
     "stokes_scale": dist.LogNormal(math.log(0.01), 1.0),
     "stokes_error_factor": dist.LogNormal(math.log(1.5), 0.7),
-    # A body under unit irradiance is bright at an exposure of about 7, whatever it is made of.
+    # Bodies under unit irradiance come near full scale at exposures of 5 to 15.
     "exposure": dist.LogNormal(math.log(7.0), 3.0),
     "intensity_scale": dist.LogNormal(math.log(0.02), 1.0),
 }
