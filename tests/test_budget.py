@@ -27,7 +27,7 @@ CODE = {
     "scenes": 1758,
     "own files": 1581,
     "models": 321,
-    "tests": 22794,
+    "tests": 22797,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
