@@ -163,8 +163,7 @@ def declare_readings(
             numpyro.deterministic("refractive_index", index[..., None])
 
     # Readings without noise (eq. 1), and the likelihood.
-    sensor = {name: noise[name] for name in noise.keys() & {"exposure"}}
-    prediction = scene.predict(parameters | sensor, data.geometry)
+    prediction = scene.predict(parameters | noise, data.geometry)
     with over_axes(data):
         for name, link in links.items():
             numpyro.deterministic(f"{name}_mean", link.center(name, prediction, noise))

@@ -451,7 +451,9 @@ def _record(
     levels = {name: _align_image(level, axes) for name, level in chosen.items()}
     if "exposure" in chosen:
         parameters["exposure"] = _align_image(chosen["exposure"], axes - 1)
-    prediction = scene.predict(parameters, layout.geometry)
+    prediction = alone  # only an instrument knows of the exposure
+    if scene.instrument is not None:
+        prediction = scene.predict(parameters, layout.geometry)
     prediction = {n: jnp.broadcast_to(x, layout.shape) for n, x in prediction.items()}
     recorded: dict[str, Array] = {}
     data = layout

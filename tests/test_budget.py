@@ -15,7 +15,7 @@ CODE = {
     "capture": 834,
     "cli": 1270,
     "design": 1102,
-    "diagnostics": 1862,
+    "diagnostics": 1863,
     "importers": 2098,
     "inference": 2735,
     "maps": 1706,
@@ -25,17 +25,17 @@ CODE = {
     "physics": 2760,
     "reporting": 3261,
     "scenes": 1758,
-    "own files": 1581,
-    "models": 321,
-    "tests": 22797,
+    "own files": 1583,
+    "models": 320,
+    "tests": 22796,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25679,
+    "code": 25681,
     "classes": 333,
     "constants": 419,
-    "Any": 177,
+    "Any": 178,
     "longest function": 80,
 }
 """Limits of the whole package; the limit of `longest function` is in lines.

@@ -24,7 +24,7 @@ from arviz_stats.base import array_stats
 
 from polar_bayes.diagnostics.finding import join
 from polar_bayes.diagnostics.limits import LIMITS
-from polar_bayes.diagnostics.parameters import MIN_DRAWS, SAMPLE_DIMS
+from polar_bayes.diagnostics.parameters import MIN_DRAWS, SAMPLE_DIMS, Scalar
 from polar_bayes.diagnostics.residuals import readings_alone, residuals_of
 from polar_bayes.diagnostics.view import FitView, once
 from polar_bayes.inference.result import CENTRAL_95
@@ -45,9 +45,7 @@ def sensitivity(fit: FitView) -> pd.DataFrame:
     weights = [_scaled_weights(total_density(fit.result, group)) for group in groups]
     alone = readings_alone(residuals_of(fit))
     rows = []
-    for scalar in fit.scalars:
-        prior = fit.prior.get(scalar.label)
-        compared = _compare(None if prior is None else prior.draws, scalar.draws)
+    for scalar, compared in _comparisons(fit):
         rates = [_sensitivity(scalar.draws, each) for each in weights]
         remarks = _remarks(scalar.draws, compared, *rates)
         if scalar.label in alone:
@@ -56,6 +54,13 @@ def sensitivity(fit: FitView) -> pd.DataFrame:
         rows.append([*compared, *rates, "; ".join(remarks)])
     index = pd.Index([scalar.label for scalar in fit.scalars])
     return pd.DataFrame(rows, columns=list(COLUMNS), index=index)
+
+
+@once
+def _comparisons(fit: FitView) -> list[tuple[Scalar, list[Any]]]:
+    """Compare each parameter with its prior; the verdict is last."""
+    priors = {label: scalar.draws for label, scalar in fit.prior.items()}
+    return [(each, _compare(priors.get(each.label), each.draws)) for each in fit.scalars]
 
 
 def _compare(prior: np.ndarray | None, posterior: np.ndarray) -> list[Any]:
@@ -75,26 +80,25 @@ def _compare(prior: np.ndarray | None, posterior: np.ndarray) -> list[Any]:
 
 def determination_sentences(fit: FitView) -> Iterator[str]:
     """Name the material parameters that the data determine in part or not, and what would help."""
-    material = [scalar for scalar in fit.scalars if scalar.is_material and fit.method != "point"]
-    found: dict[str, Counter[str]] = {"partly": Counter(), "not determined": Counter()}
-    for scalar in material:
-        prior = fit.prior.get(scalar.label)
-        judged = _compare(None if prior is None else prior.draws, scalar.draws)[-1]
-        found.get(judged, Counter())[scalar.name] += 1
-    total = Counter(scalar.name for scalar in material)
-    names = {
-        verdict: join([n if k == total[n] else f"{n} ({k} of {total[n]})" for n, k in each.items()])
-        for verdict, each in found.items()
+    if fit.method == "point":
+        return
+    phrases = {
+        "partly": "The data determine only in part: {}. There the prior still matters.",
+        "not determined": "The data do not determine {}. There the interval is mostly the prior's: "
+        "do not quote it as a measurement.",
     }
-    if partly := names["partly"]:
-        yield f"The data determine only in part: {partly}. There the prior still matters."
-    if undetermined := names["not determined"]:
-        yield (
-            f"The data do not determine {undetermined}. There the interval is mostly the prior's: "
-            "do not quote it as a measurement."
-        )
+    material = [
+        (scalar.name, found[-1]) for scalar, found in _comparisons(fit) if scalar.is_material
+    ]
+    total = Counter(name for name, _ in material)
+    for verdict, phrase in phrases.items():
+        names = Counter(name for name, judged in material if judged == verdict)
+        if names:
+            yield phrase.format(
+                join([n if k == total[n] else f"{n} ({k} of {total[n]})" for n, k in names.items()])
+            )
     full = fit.provenance.get("counts", {}).get("saturated")
-    if full and any(names.values()):
+    if full and not {verdict for _, verdict in material}.isdisjoint(phrases):
         yield f"Saturated readings: {full}. They tell little, so a shorter exposure may tell more."
 
 

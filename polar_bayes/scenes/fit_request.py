@@ -205,10 +205,10 @@ def _provenance(request: Request, method: AbstractMethod, problem: Problem) -> P
     at_boundary = {
         name: int(np.sum((np.asarray(link.reading(x)) != x) & data.fitted(name)))
         for name, link in request.links.items()
-        for x in [np.asarray(data.readings[name])]
+        for x in [data.readings[name]]
     }
     packages = ("polar_bayes", "jax", "numpyro", "arviz", "optimistix", "numpy", "xarray")
-    used = {"used": int(np.sum(np.asarray(data.valid))), "at_margin": at_boundary}
+    used = {"used": int(np.sum(data.valid)), "at_margin": at_boundary}
     return {
         "settings": dataclasses.asdict(method),
         "method_parts": repr(method),
