@@ -140,9 +140,21 @@ def _mutated(data, random, mutations, count):
 # --- mutations of a result: each takes a tree and gives another -------------------------------
 
 
+def narrow(group, random):
+    name = any_variable(group, random)
+    return group.assign({name: group[name].isel({pick(random, group[name].dims): 0}, drop=True)})
+
+
+GROUP_MUTATIONS = (
+    drop, rename, add, swap, retype, renumber, fill, rename_dim, select, widen, label, narrow,
+    narrow,
+)  # fmt: skip
+"""Those of captures that a reader of results notices: not the order of dims, nor attributes."""
+
+
 def edit_group(tree, random):
     name = pick(random, sorted(tree.children))
-    changed = pick(random, MUTATIONS)(tree[name].to_dataset(), random)
+    changed = pick(random, GROUP_MUTATIONS)(tree[name].to_dataset(), random)
     return tree.assign({name: xr.DataTree(changed)})
 
 

@@ -11,13 +11,13 @@ ROOT = Path(__file__).parents[1]
 
 CODE = {
     "benchmark": 580,
-    "calibration": 1038,
+    "calibration": 1037,
     "capture": 834,
     "cli": 1270,
     "design": 1102,
-    "diagnostics": 1863,
+    "diagnostics": 1864,
     "importers": 2098,
-    "inference": 2735,
+    "inference": 2739,
     "maps": 1706,
     "methods": 1265,
     "numerics": 997,
@@ -27,14 +27,14 @@ CODE = {
     "scenes": 1758,
     "own files": 1583,
     "models": 320,
-    "tests": 22796,
+    "tests": 22819,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25681,
+    "code": 25685,
     "classes": 333,
-    "constants": 419,
+    "constants": 420,
     "Any": 178,
     "longest function": 80,
 }

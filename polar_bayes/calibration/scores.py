@@ -101,8 +101,7 @@ def uniformity(sample: Float[np.ndarray, " size"]) -> Uniformity:
         return Uniformity(math.nan, math.nan, math.nan)
     null = null_statistics(len(sample))
     rank = 1 + np.searchsorted(null, _smallest_p_value(sample[None])[0], side="right")
-    with np.errstate(over="ignore"):  # an edited file may hold more than 1
-        spread = sample.std() * 12.0**0.5
+    spread = sample.std() * 12.0**0.5
     return Uniformity(float(rank / (1 + NULL_SAMPLES)), float(sample.mean()), float(spread))
 
 

@@ -55,7 +55,6 @@ def _corrections(weights: np.ndarray, found: Sequence[Scalar]) -> Iterator[str]:
         draws = scalar.draws.ravel()
         if not np.isfinite(draws).all() or not np.ptp(draws) > 0.0:
             continue
-        draws = draws / np.abs(draws).max()  # squares do not overflow; shift and ratio are the same
         mean = weights @ draws
         sd = math.sqrt(weights @ (draws - mean) ** 2)
         shift, ratio = abs(mean - draws.mean()) / sd, draws.std() / sd

@@ -75,10 +75,9 @@ def budget(
     rows = {}
     for scalar in fit.scalars:
         if scalar.is_material:
-            with np.errstate(all="ignore"):  # draws of a damaged file may be huge
-                joint = _covariance(scalar, {**errors, **weights})
-                noise = _share_of_noise(scalar, densities)
-                rows[scalar.label] = _row(joint, noise, stated, asked)
+            joint = _covariance(scalar, {**errors, **weights})
+            noise = _share_of_noise(scalar, densities)
+            rows[scalar.label] = _row(joint, noise, stated, asked)
     smooth = [DISCREPANCY] if weights else []
     columns = ["sd", "perfect", "noise", "prior", *smooth, *stated.index]
     table = PrintedFrame.from_dict(rows, orient="index", columns=columns)

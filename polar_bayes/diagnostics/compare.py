@@ -132,22 +132,29 @@ def compare_predictions(fits: Mapping[str, FitView]) -> tuple[pd.DataFrame, dict
         if any(not np.array_equal(own[n], expected[n]) for n in own):
             names = f"{first} and {name} have set aside different views"
             return pd.DataFrame(), {"": f"They were fitted to different readings: {names}."}
-    table = compare({name: _combined(parts) for name, parts in found.items()}, round_to="none")
+    # Weights take exponentials of densities; what all fits share cancels, and would overflow.
+    best = np.max([_pointwise(parts) for parts in found.values()], axis=0)
+    combined = {name: _combined(parts, best) for name, parts in found.items()}
+    table = compare(combined, round_to="none")
     unreliable = {name: sum(part.unreliable for part in parts) for name, parts in found.items()}
     columns = ["elpd", "se", "p", "elpd_diff", "dse", "weight"]
     return table[columns].assign(unreliable=pd.Series(unreliable)), left_out
 
 
-def _combined(parts: list[Loo]) -> ELPDDataLOO:
+def _pointwise(parts: list[Loo]) -> np.ndarray:
+    return np.concatenate([part.pointwise for part in parts])
+
+
+def _combined(parts: list[Loo], best: np.ndarray) -> ELPDDataLOO:
     """Stack the readings of all variables in the arrays that ArviZ expects."""
-    each = xr.DataArray(np.concatenate([part.pointwise for part in parts]), dims="reading")
+    each = _pointwise(parts)
     return ELPDDataLOO(
         elpd=float(each.sum()),
         se=float(np.sqrt(each.size * each.var())),
         p=sum(part.p_loo for part in parts),
         n_data_points=each.size,
         scale="log",
-        elpd_i=each,
+        elpd_i=xr.DataArray(each - best, dims="reading"),
         # The columns of the table that are used do not depend on these.
         n_samples=1,
         warning=False,

@@ -157,8 +157,7 @@ def _carriers(found: Sequence[Scalar]) -> list[Scalar]:
     if not material:
         return judged
     moving = [s for s in judged if np.ptp(s.draws) > 0.0]
-    scaled = [s.draws.ravel() / np.abs(s.draws).max() for s in moving]  # squares do not overflow
-    correlation = np.atleast_2d(np.corrcoef(scaled))
+    correlation = np.atleast_2d(np.corrcoef([s.draws.ravel() for s in moving]))
     of_material = np.abs(correlation[:, [s.is_material for s in moving]])
     carrying = {
         s.label for s, row in zip(moving, of_material, strict=True) if (row >= CARRIES).any()

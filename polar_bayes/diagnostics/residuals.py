@@ -276,6 +276,7 @@ def _p_value(observed: float, replicates: np.ndarray) -> float:
 
 
 def _moran(e: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+    e = e / np.max(np.abs(e), axis=1, keepdims=True)  # squares of residuals of any size
     return np.sum((e @ kernel) * e, axis=1) / np.sum(e**2, axis=1)
 
 

@@ -148,7 +148,10 @@ Variables = Mapping[str, xr.Variable]
 NUMBERS, FLAGS, TEXTS = "biuf", "biu", "OSUT"
 """Kinds of NumPy types; text is read from files as objects."""
 
-_KIND_NAMES = {NUMBERS: "real numbers", FLAGS: "whole numbers or truth values", TEXTS: "text"}
+LARGEST = np.float64(1e150)
+"""No finite number of a result is larger: variances are sums of squares."""
+
+_KIND_NAMES = {NUMBERS: "real numbers of 64 bits", FLAGS: "integers or truth values", TEXTS: "text"}
 
 
 class Like(NamedTuple):
@@ -207,7 +210,7 @@ class Group:
 
     def _check_variable(self, name: str, variable: xr.Variable, where: str) -> Problems:
         kinds, dims = self.kinds.get(name, NUMBERS), set(variable.dims)
-        if variable.dtype.kind not in kinds:
+        if variable.dtype.kind not in kinds or variable.dtype == np.longdouble:
             yield where, f"it holds {variable.dtype}, not {_KIND_NAMES[kinds]}"
         expected = self.variables.get(name, self.dims)
         is_closed = name in self.variables or not self.extra_dims
@@ -215,6 +218,9 @@ class Group:
             yield where, f"its dims are {dims_text(variable.dims)}, not {dims_text(expected)}"
         if odd := [dim for dim in self.never if dim in dims]:
             yield where, f"it has the dim {odd[0]}"
+        size = np.abs(variable.values) if variable.dtype.kind == "f" else np.empty(0)
+        if np.any((size > LARGEST) & (size < np.inf)):
+            yield where, f"it holds a number above {LARGEST:g}, whose square overflows"
         yield from _check_json(variable.attrs, self.variable_attributes, where)
 
     def check_dims(self, own: Variables, read: Mapping[str, Variables], where: str) -> Problems:

@@ -45,6 +45,17 @@ def test_predictions_are_those_of_the_reports_and_of_arviz() -> None:
         np.testing.assert_allclose(loo[column], theirs.loc[loo.index, column], rtol=2e-3, atol=1e-3)
 
 
+@each("by", [-2_000.0, 2_000.0])
+def test_readings_that_every_fit_contradicts_or_foretells_are_compared(by: float) -> None:
+    """Exponentials of such densities leave double precision, those of their differences do not."""
+    good, bad = make_result(**SMALL), off(make_result(**SMALL), 1.0)
+    plain = pb.diagnostics.compare_fits({"bad": bad, "good": good}).loo
+    moved = {"bad": off(bad, by), "good": off(good, by)}
+    loo = pb.diagnostics.compare_fits(moved).loo
+    for column in ("elpd_diff", "dse", "weight"):
+        np.testing.assert_allclose(loo[column], plain[column], rtol=1e-6, atol=1e-9)
+
+
 @pytest.mark.thorough
 def test_all_variables_count_together() -> None:
     two = {**SMALL, "variables": ("dop", "intensity")}
