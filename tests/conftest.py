@@ -14,6 +14,7 @@ os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")  # befo
 import jax
 import mpmath
 import pytest
+from compilations import drop_programs
 from pages import blank_pictures
 
 from polar_bayes.scenes.fit_request import fit_request
@@ -36,11 +37,9 @@ def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def few_programs() -> Iterator[None]:
-    """Linux gives a process 65,530 memory maps, and XLA aborts without one for a program."""
+    """Let a file of tests start with few programs."""
     yield
-    maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > 30_000:
-        jax.clear_caches()
+    drop_programs()
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from cases import each
-from compilations import compiled_fast
+from compilations import compiled_fast, drop_programs
 from test_architecture import LAYERS
 
 import polar_bayes as pb
@@ -108,11 +108,12 @@ IN_FULL, OF_A_PLATE = Fits(), Fits(scene=PLATE, links={"dop": pb.links.NormalLin
 
 @pytest.fixture
 def settings_of_jax() -> Iterator[None]:
-    """Take back what a page changes."""
+    """Take back what a page changes; its programs take thousands of memory maps."""
     saved = {name: getattr(jax.config, name) for name in CHANGED}
     yield
     for name, value in saved.items():
         jax.config.update(name, value)
+    drop_programs()
 
 
 @pytest.mark.usefixtures("settings_of_jax")
