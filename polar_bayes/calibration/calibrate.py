@@ -241,11 +241,11 @@ class Forecast:
         """Fit the same simulations by the faster method, and describe its time and results."""
         plan = dataclasses.replace(self.plan, settings=make_method(self.faster), readings=False)
         own = join(self._seen, sys.maxsize)
-        numbers = numbers_of(own)
-        fit_block(plan, numbers)  # compiles its programs
+        parts = cut(numbers_of(own), plan.block)
+        fit_block(plan, parts[0])  # compiles its programs
         begin = time.perf_counter()
-        other = fit_block(plan, numbers)
-        minutes = left * (time.perf_counter() - begin) / len(numbers) / 60.0
+        other = join([fit_block(plan, part) for part in parts], sys.maxsize)
+        minutes = left * (time.perf_counter() - begin) / sum(map(len, parts)) / 60.0
         both = np.all([each["fits"]["status"] == Status.GOOD for each in (own, other)], axis=0)
         one, two = (each["marginals"].to_dataset().isel(simulation=both) for each in (own, other))
         moved = [(abs(two[name] - one[name]) / one[f"{name}_sd"]).values for name in own["truth"]]

@@ -250,8 +250,8 @@ def csv_link(table: pd.DataFrame, first: str) -> str:
     labels = [str(name) for name in table.index.names] if table.index.nlevels > 1 else [first]
     safe = table.reset_index(names=labels, allow_duplicates=True).map(_escape_formula)
     safe.columns = pd.Index([*labels, *(_escape_formula(str(name)) for name in table.columns)])
-    text = safe.to_csv(index=False, quoting=csv.QUOTE_NONNUMERIC)
-    return f"data:text/csv;charset=utf-8;base64,{base64.b64encode(text.encode()).decode('ascii')}"
+    text = safe.to_csv(index=False, quoting=csv.QUOTE_NONNUMERIC).encode(errors="backslashreplace")
+    return f"data:text/csv;charset=utf-8;base64,{base64.b64encode(text).decode('ascii')}"
 
 
 def _escape_formula(value: object) -> object:
