@@ -400,7 +400,7 @@ def _repeats(fit: FitView) -> Finding:
     observed = fit.result["observed_data"].to_dataset()
     constants = fit.result["constant_data"].to_dataset()
     columns = [
-        values.transpose("view", ...).to_numpy().reshape(observed.sizes["view"], -1)
+        values.transpose("view", ...).to_numpy().reshape(values.sizes["view"], -1)
         for values in (
             *(constants[name] for name in ANGLES),
             *observed.data_vars.values(),
