@@ -8,6 +8,7 @@ programs of its own.
 
 import ast
 import contextlib
+import functools
 import importlib
 import inspect
 import re
@@ -31,6 +32,7 @@ from polar_bayes.cli import commands
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
+from polar_bayes.scenes.fit_request import fit_request
 from polar_bayes.scenes.fitting import fit
 
 ROOT = Path(__file__).parents[1]
@@ -128,9 +130,10 @@ def settings_of_jax() -> Iterator[None]:
         ),
     ],
 )
-def test_the_python_of_a_page_runs(page, fits, tmp_path, monkeypatch, request):
+def test_the_python_of_a_page_runs(page, fits, tmp_path, monkeypatch):
     if fits is OF_A_PLATE:
-        request.getfixturevalue("without_comparisons")
+        alone = functools.partial(fit_request, with_comparisons=False)
+        monkeypatch.setattr("polar_bayes.scenes.fitting.fit_request", alone)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(pb, "fit", fits)
     namespace: dict[str, object] = {"__name__": page.stem}
