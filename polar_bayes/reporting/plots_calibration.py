@@ -122,8 +122,8 @@ def histogram_panel(axes: Axes, ranks: Ranks) -> None:
     axes.axhspan(low, high, color=style.lighten(GRAY, 0.75), lw=0)
     axes.axhline(1.0, color=GRAY, lw=0.8, ls="--")
     color = BLUE if ranks.passes else VERMILLION
-    density, edges = np.histogram(ranks.answered, bins, range=(0.0, 1.0), density=True)
-    axes.stairs(density, edges, baseline=None, color=color, lw=1.3)
+    heights, edges = np.histogram(ranks.answered, bins, range=(0.0, 1.0))
+    axes.stairs(heights * bins / count, edges, baseline=None, color=color, lw=1.3)
     axes.set(xlim=(0, 1), xticks=[0, 0.5, 1])
     axes.set_ylim(0.0, max(1.12 * high, 1.06 * axes.get_ylim()[1]))
 
