@@ -17,7 +17,7 @@ CODE = {
     "design": 1102,
     "diagnostics": 1864,
     "importers": 2098,
-    "inference": 2739,
+    "inference": 2743,
     "maps": 1706,
     "methods": 1265,
     "numerics": 997,
@@ -32,7 +32,7 @@ CODE = {
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25685,
+    "code": 25689,
     "classes": 333,
     "constants": 420,
     "Any": 178,

@@ -218,8 +218,7 @@ class Group:
             yield where, f"its dims are {dims_text(variable.dims)}, not {dims_text(expected)}"
         if odd := [dim for dim in self.never if dim in dims]:
             yield where, f"it has the dim {odd[0]}"
-        size = np.abs(variable.values) if variable.dtype.kind == "f" else np.empty(0)
-        if np.any((size > LARGEST) & (size < np.inf)):
+        if variable.dtype.kind == "f" and _is_too_large(variable.values):
             yield where, f"it holds a number above {LARGEST:g}, whose square overflows"
         yield from _check_json(variable.attrs, self.variable_attributes, where)
 
@@ -294,6 +293,14 @@ class Schema:
                 first, expected = sizes.setdefault(str(dim), (name, size))
                 if size != expected:
                     yield name, f"its {dim} has {size} entries, that of {first} {expected}"
+
+
+def _is_too_large(values: np.ndarray) -> bool:
+    """Return whether a finite number is too large; predictions may fill half of the memory."""
+    least, most = (end.reduce(values, None, initial=0.0) for end in (np.fmin, np.fmax))
+    if -LARGEST <= least and most <= LARGEST:
+        return False
+    return bool(np.any(np.abs(values[np.isfinite(values)]) > LARGEST))
 
 
 def _check_node(node: xr.DataTree, where: str) -> Problems:
