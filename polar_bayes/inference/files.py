@@ -210,7 +210,7 @@ class Group:
 
     def _check_variable(self, name: str, variable: xr.Variable, where: str) -> Problems:
         kinds, dims = self.kinds.get(name, NUMBERS), set(variable.dims)
-        if variable.dtype.kind not in kinds or variable.dtype == np.longdouble:
+        if variable.dtype.kind not in kinds or variable.dtype.str.endswith("f16"):
             yield where, f"it holds {variable.dtype}, not {_KIND_NAMES[kinds]}"
         expected = self.variables.get(name, self.dims)
         is_closed = name in self.variables or not self.extra_dims
