@@ -1,10 +1,19 @@
 """What JAX compiles, counted by tests and benchmarks."""
 
 import contextlib
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 
 import jax
+
+from polar_bayes.scenes.fit_request import fit_request
+
+
+def fit_alone(patch) -> None:
+    """Let fits do without those of other scenes, which compile programs of their own."""
+    alone = functools.partial(fit_request, with_comparisons=False)
+    patch.setattr("polar_bayes.scenes.fitting.fit_request", alone)
 
 
 def drop_programs() -> None:

@@ -3,7 +3,6 @@
 What a test computes once need not be fast: XLA optimizes nothing, which takes a third of the time.
 """
 
-import functools
 import gc
 import os
 from collections.abc import Iterator
@@ -14,10 +13,8 @@ os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")  # befo
 import jax
 import mpmath
 import pytest
-from compilations import drop_programs
+from compilations import drop_programs, fit_alone
 from pages import blank_pictures
-
-from polar_bayes.scenes.fit_request import fit_request
 
 jax.config.update("jax_enable_x64", True)
 gc.set_threshold(100_000, 50)  # traces are many objects and few cycles: a tenth of the time
@@ -52,10 +49,9 @@ def compiled_in_haste() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def without_comparisons() -> Iterator[None]:
-    """Fits alone, without those of other scenes, which compile programs of their own."""
-    alone = functools.partial(fit_request, with_comparisons=False)
+    """Fits of a file of tests alone."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("polar_bayes.scenes.fitting.fit_request", alone)
+        fit_alone(patch)
         yield
 
 

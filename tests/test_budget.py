@@ -15,7 +15,7 @@ CODE = {
     "capture": 834,
     "cli": 1270,
     "design": 1102,
-    "diagnostics": 1864,
+    "diagnostics": 1867,
     "importers": 2098,
     "inference": 2743,
     "maps": 1706,
@@ -27,12 +27,12 @@ CODE = {
     "scenes": 1758,
     "own files": 1583,
     "models": 320,
-    "tests": 22825,
+    "tests": 22832,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25689,
+    "code": 25692,
     "classes": 333,
     "constants": 420,
     "Any": 178,

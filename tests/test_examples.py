@@ -8,7 +8,6 @@ programs of its own.
 
 import ast
 import contextlib
-import functools
 import importlib
 import inspect
 import re
@@ -23,7 +22,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from cases import each
-from compilations import compiled_fast, drop_programs
+from compilations import compiled_fast, drop_programs, fit_alone
 from test_architecture import LAYERS
 
 import polar_bayes as pb
@@ -32,7 +31,6 @@ from polar_bayes.cli import commands
 from polar_bayes.inference.program import compile_program
 from polar_bayes.inference.request import resolve
 from polar_bayes.observation.data import observe
-from polar_bayes.scenes.fit_request import fit_request
 from polar_bayes.scenes.fitting import fit
 
 ROOT = Path(__file__).parents[1]
@@ -132,8 +130,7 @@ def settings_of_jax() -> Iterator[None]:
 )
 def test_the_python_of_a_page_runs(page, fits, tmp_path, monkeypatch):
     if fits is OF_A_PLATE:
-        alone = functools.partial(fit_request, with_comparisons=False)
-        monkeypatch.setattr("polar_bayes.scenes.fitting.fit_request", alone)
+        fit_alone(monkeypatch)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(pb, "fit", fits)
     namespace: dict[str, object] = {"__name__": page.stem}

@@ -1,5 +1,6 @@
 """Alternatives to parts of a fit's scene, and the answers that they give."""
 
+import numpy as np
 import pandas as pd
 import xarray as xr
 
@@ -51,7 +52,8 @@ def alternatives(result: xr.DataTree | FitView) -> pd.DataFrame:
     rows, labels = [], []
     for each in compared:
         for scalar, shift in with_entries(material or fit.scalars, each.get("shift") or {}):
-            mean, sd = float(scalar.draws.mean()), float(scalar.draws.std())
+            with np.errstate(invalid="ignore"):  # draws may be infinite: what is not known is NaN
+                mean, sd = float(scalar.draws.mean()), float(scalar.draws.std())
             redefined = scalar.name in each["defines"]
             given = [each[name] for name in COLUMNS[:4]]
             rows.append([*given, mean, mean + shift * sd, shift, redefined])

@@ -55,6 +55,7 @@ def _corrections(weights: np.ndarray, found: Sequence[Scalar]) -> Iterator[str]:
         draws = scalar.draws.ravel()
         if not np.isfinite(draws).all() or not np.ptp(draws) > 0.0:
             continue
+        draws = draws / np.abs(draws).max()  # squares do not vanish; shift and ratio are the same
         mean = weights @ draws
         sd = math.sqrt(weights @ (draws - mean) ** 2)
         shift, ratio = abs(mean - draws.mean()) / sd, draws.std() / sd

@@ -75,9 +75,10 @@ def budget(
     rows = {}
     for scalar in fit.scalars:
         if scalar.is_material:
-            joint = _covariance(scalar, {**errors, **weights})
-            noise = _share_of_noise(scalar, densities)
-            rows[scalar.label] = _row(joint, noise, stated, asked)
+            with np.errstate(all="ignore"):  # draws may be infinite: what is not known is NaN
+                joint = _covariance(scalar, {**errors, **weights})
+                noise = _share_of_noise(scalar, densities)
+                rows[scalar.label] = _row(joint, noise, stated, asked)
     smooth = [DISCREPANCY] if weights else []
     columns = ["sd", "perfect", "noise", "prior", *smooth, *stated.index]
     table = PrintedFrame.from_dict(rows, orient="index", columns=columns)

@@ -133,21 +133,17 @@ def compare_predictions(fits: Mapping[str, FitView]) -> tuple[pd.DataFrame, dict
             names = f"{first} and {name} have set aside different views"
             return pd.DataFrame(), {"": f"They were fitted to different readings: {names}."}
     # Weights take exponentials of densities; what all fits share cancels, and would overflow.
-    best = np.max([_pointwise(parts) for parts in found.values()], axis=0)
-    combined = {name: _combined(parts, best) for name, parts in found.items()}
+    stacked = {n: np.concatenate([part.pointwise for part in p]) for n, p in found.items()}
+    best = np.max(list(stacked.values()), axis=0)
+    combined = {name: _combined(found[name], each, best) for name, each in stacked.items()}
     table = compare(combined, round_to="none")
     unreliable = {name: sum(part.unreliable for part in parts) for name, parts in found.items()}
     columns = ["elpd", "se", "p", "elpd_diff", "dse", "weight"]
     return table[columns].assign(unreliable=pd.Series(unreliable)), left_out
 
 
-def _pointwise(parts: list[Loo]) -> np.ndarray:
-    return np.concatenate([part.pointwise for part in parts])
-
-
-def _combined(parts: list[Loo], best: np.ndarray) -> ELPDDataLOO:
-    """Stack the readings of all variables in the arrays that ArviZ expects."""
-    each = _pointwise(parts)
+def _combined(parts: list[Loo], each: np.ndarray, best: np.ndarray) -> ELPDDataLOO:
+    """Return what ArviZ compares, of the stacked readings of all variables."""
     return ELPDDataLOO(
         elpd=float(each.sum()),
         se=float(np.sqrt(each.size * each.var())),

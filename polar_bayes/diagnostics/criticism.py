@@ -157,7 +157,8 @@ def _carriers(found: Sequence[Scalar]) -> list[Scalar]:
     if not material:
         return judged
     moving = [s for s in judged if np.ptp(s.draws) > 0.0]
-    correlation = np.atleast_2d(np.corrcoef([s.draws.ravel() for s in moving]))
+    scaled = [s.draws.ravel() / np.abs(s.draws).max() for s in moving]  # squares do not vanish
+    correlation = np.atleast_2d(np.corrcoef(scaled))
     of_material = np.abs(correlation[:, [s.is_material for s in moving]])
     carrying = {
         s.label for s, row in zip(moving, of_material, strict=True) if (row >= CARRIES).any()

@@ -148,8 +148,9 @@ def _check(
     variable: FlatVariable, relative_ess: float, correction: np.ndarray | None
 ) -> PredictiveCheck:
     name, observed, predicted = variable.name, variable.observed, variable.predicted
-    residual = observed - variable.noise_free.mean(axis=0)
-    rms = float(np.sqrt(np.mean(residual**2)))
+    with np.errstate(all="ignore"):  # predictions may be infinite
+        residual = observed - variable.noise_free.mean(axis=0)
+        rms = float(np.sqrt(np.mean(residual**2)))
     if len(predicted) < MIN_DRAWS or not np.isfinite(predicted).all():
         return PredictiveCheck(name, observed.size, rms, np.empty(0), {}, None)
     pit = _pit(variable, np.full(predicted.shape, 1.0 / len(predicted)))

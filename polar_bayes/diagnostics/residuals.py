@@ -107,7 +107,7 @@ def residuals_of(fit: FitView) -> Residuals | None:
     absorbed, root = ((axes * scale) @ axes.T for scale in (share, np.sqrt(1.0 - share)))
     replicated = noise[pick] - _score(noise[pick], freedom) @ absorbed + centered[pick] @ root
     material = {s.label: s.draws.ravel()[rows] for s in fit.scalars if s.is_material}
-    material = {n: x for n, x in material.items() if np.isfinite(x).all() and np.ptp(x) > 0.0}
+    material = {n: x for n, x in material.items() if np.isfinite(x).all() and x.std() > 0.0}
     scores = np.array([(x - x.mean()) / x.std() for x in material.values()]).reshape(
         len(material), len(centered)
     )

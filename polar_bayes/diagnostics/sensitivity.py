@@ -70,7 +70,7 @@ def _compare(prior: np.ndarray | None, posterior: np.ndarray) -> list[Any]:
     if prior is None or not np.isfinite([*ends, prior_width]).all() or not prior_width > 0.0:
         return [*ends, math.nan, math.nan, math.nan, "unknown"]
     inside = float(np.mean((prior >= low) & (prior <= high)))
-    with np.errstate(all="ignore"):  # the variance of huge numbers overflows
+    with np.errstate(all="ignore"):  # the variance of tiny numbers is zero
         contraction = 1.0 - float(np.var(posterior) / np.var(prior))
     verdict = "not determined"
     if inside <= LIMITS.partly:

@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 from cases import each
 from plates import LINKS, PLATE, plate_capture
-from synthetic_results import edit_provenance, make_result
+from synthetic_results import edit_provenance, make_result, replace
 
 import polar_bayes as pb
 from polar_bayes.diagnostics.budget import _row, better_known, budget_sentences, variance_shares
@@ -54,6 +54,14 @@ def perfect(capture: xr.Dataset) -> xr.DataTree:
 
 def sds(fit: xr.DataTree) -> np.ndarray:
     return pb.summary(fit).loc[["subsurface_fraction", "refractive_index"], "sd"].to_numpy()
+
+
+@each("change", [lambda x: x * 1e-200, lambda x: x.where(x["draw"] > 0, np.inf)])
+@each("name", ["refractive_index", "sample_lean_offset"])
+def test_draws_that_vanish_or_are_infinite_have_a_budget_and_a_verdict(fit, name, change):
+    edited = replace(fit.copy(), "posterior", name, change(fit["posterior"].to_dataset()[name]))
+    assert pb.budget(edited).shape == pb.budget(fit).shape
+    assert pb.verdict(edited).not_checked is not None
 
 
 # Of 2,000 draws a standard deviation has a relative standard error of 1.6%, a ratio of two 2.2%.
