@@ -251,6 +251,6 @@ class Forecast:
         moved = [(abs(two[name] - one[name]) / one[f"{name}_sd"]).values for name in own["truth"]]
         largest = max((np.max(each, initial=0.0) for each in moved), default=0.0)
         return (
-            f", by {self.faster} about {max(minutes, 0.1):.2g} min; both trust {both.sum()} of "
+            f", by {self.faster} about {max(minutes, 0.1):.1f} min; both trust {both.sum()} of "
             f"{len(both)}, whose means differ by at most {largest:.2g} sd"
         )
