@@ -345,10 +345,10 @@ def judge(capture: xr.Dataset, truth: Mapping[str, float], **settings: Any) -> d
     result = pb.fit(capture, **settings)
     table, found = criticize(result), pb.verdict(result)
     summary = pb.summary(result)
-    rows = {name: summary.loc[name] for name in truth if name in summary.index}
-    misses = {
-        name: max(row["q2.5"] - truth[name], truth[name] - row["q97.5"]) / row["sd"]
-        for name, row in rows.items()
+    misses = {  # of an index at one wavelength, too
+        label: max(row["q2.5"] - truth[name], truth[name] - row["q97.5"]) / row["sd"]
+        for label, row in summary.iterrows()
+        if (name := str(label).partition("[")[0]) in truth
     }
     return {
         "truth": {name: float(value) for name, value in truth.items()},

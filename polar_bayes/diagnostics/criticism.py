@@ -31,7 +31,6 @@ from polar_bayes.diagnostics.view import FitView, Provenance, once, view_of
 from polar_bayes.errors import FitError
 from polar_bayes.inference.checks import (
     CARRIES,
-    LARGE_FACTOR,
     MASS_AT_BOUND,
     NOISE_FACTOR,
     excluding_bounds,
@@ -252,8 +251,9 @@ def _noise(fit: FitView) -> Finding:
     for scalar in (s for s in noise if s.name == NOISE_FACTOR):
         low, high = np.quantile(scalar.draws, CENTRAL_95)
         factor = f"{np.median(scalar.draws):.3g} times [{low:.3g}, {high:.3g}] {errors}"
-        if low > LARGE_FACTOR:
-            least = "caution"
+        # The fit takes the factor for what it is; beyond what its prior allows it is a caution.
+        if low > LIMITS.large_noise_factor:
+            least = "note"
             sentence = (
                 f"The readings scatter {factor}: these errors are too small, or the scene "
                 "lacks what the readings show; check the errors, or try polar_bayes.compare_scenes."
@@ -456,12 +456,14 @@ def _alternatives(fit: FitView, absent: Sequence[Scalar]) -> Finding:
         # What a smooth error has stood in for without harm to the answer only widens it.
         stands_in = part == NOTHING and not moves.any()
         return judged_by(p_value, highest, sentence, most="caution" if stands_in else "problem")
-    # Under a layer that is as likely as none, to a bare mention, the index is not that of the body.
     layer, factor = table["part"] == NOTHING, table["log_bayes_factor"]
-    hidden = layer & table.index.str.startswith(INDEX) & (factor > -LIMITS.favored)
-    favored = factor > LIMITS.favored
-    weighty = table["moves"] & (favored | hidden)
-    undecided = table[(table["moves"] & (factor > LIMITS.refuted)) | (layer & favored)]
+    allowed, favored = factor > LIMITS.refuted, factor > LIMITS.favored
+    # Bodies of any index give the same few under a film: the evidence for one never exceeds a few
+    # times, and decides nothing. What counts is how far from the interval the body's index is.
+    far = table["shift"].abs() > LIMITS.outside + LIMITS.large_difference
+    of_layer = layer & table.index.str.startswith(INDEX)
+    weighty = table["moves"] & favored.mask(of_layer, allowed & far)
+    undecided = table[(table["moves"] & allowed) | (layer & favored)]
     if undecided.empty:
         return Finding("passed", p_value, highest)
     if undecided["moves"].any():  # what stays is no other answer

@@ -13,9 +13,12 @@ class Limits:
 
     # Prior probability beyond the posterior median of one parameter that is stated.
     prior_tail: float = 0.01
-    # Stated errors that the scatter does not reach by this factor, with probability 97.5%.
+    # Factors by which the scatter exceeds its stated errors, or does not reach them, with
+    # probability 97.5%.
+    large_noise_factor: float = 3.0
     small_noise_factor: float = 1.0 / 3.0
-    # Difference of a posterior mean without the discrepancy that counts.
+    # Difference of a posterior mean that counts: without the discrepancy, and from an interval's end
+    # to the answer under an unseen layer.
     large_difference: float = 1.5
     # Difference of a posterior mean without what is absent up to which it is the same.
     same_mean: float = 0.5

@@ -19,7 +19,6 @@ from polar_bayes.inference.batching import Status
 from polar_bayes.inference.checks import (
     CARRIES,
     CAUTION,
-    LARGE_FACTOR,
     MASS_AT_BOUND,
     NEAR_BOUND,
     NOISE_FACTOR,
@@ -207,13 +206,12 @@ class PixelCriticism:
         return _flags(prior_conflict(below, ends), "PRIORS")
 
     def _of_noise(self, good: np.ndarray) -> np.ndarray:
-        """Return flags of pixels with noise above its prior or the stated errors."""
-        scalars, flags = self._checks.noise, np.zeros(good.size, np.int8)
-        if scalars:
-            tails, _ = tail_scores(self._below(scalars, good), self._checks.noise_ends)
-            flags = _flags(tails.shape[1] * tails.min(axis=1), "NOISE")
-        is_large = self._quantile(NOISE_FACTOR, LOWEST)[good] > LARGE_FACTOR
-        return np.where(is_large & (flags == 0), Criticism.NOISE_CAUTION, flags).astype(np.int8)
+        """Return flags of pixels with noise above its prior."""
+        scalars = self._checks.noise
+        if not scalars:
+            return np.zeros(good.size, np.int8)
+        tails, _ = tail_scores(self._below(scalars, good), self._checks.noise_ends)
+        return _flags(tails.shape[1] * tails.min(axis=1), "NOISE")
 
     def _below(self, scalars: tuple[Scalar, ...], good: np.ndarray) -> np.ndarray:
         """Return prior probabilities below the medians, (pixel, scalar)."""
@@ -221,20 +219,16 @@ class PixelCriticism:
         medians = ((s.name, s.of(quantiles)[MEDIAN, good]) for s in scalars)
         return np.stack([probability_below(priors[name], x) for name, x in medians], axis=1)
 
-    def _quantile(self, name: str, which: int) -> np.ndarray:
-        """Return a quantile of a noise parameter; one if the model lacks that parameter."""
-        known = self._marginals.quantiles
-        return known[name][which] if name in known else np.ones(self._at_bound.size)
-
     def _residual_tails(self, good: np.ndarray) -> np.ndarray:
         """Return p-values of residuals of pixels at their modes; NaN if not computed."""
         tails = np.full(good.size, np.nan)
         known = np.flatnonzero(np.isfinite(self._mode[1][good]).all(axis=(1, 2)))
-        factor = self._quantile(NOISE_FACTOR, MEDIAN)
+        quantiles = self._marginals.quantiles.get(NOISE_FACTOR)
+        factor = np.ones(good.size) if quantiles is None else quantiles[MEDIAN, good]
         for some in np.array_split(known, range(PIXELS, known.size, PIXELS)):
             fitted = self._fitted(good[some])
             if fitted is not None:
-                tails[some] = residual_tail(*fitted, self._checks.kernels, factor[good[some]])
+                tails[some] = residual_tail(*fitted, self._checks.kernels, factor[some])
         return tails
 
     def begin_compiling(self) -> None:

@@ -34,6 +34,11 @@ STEP = 1e-3
 """Step of central differences of a potential, in posterior sds: a gradient has a rounding error of
 1e-10, and an error of 2e-7 by a third derivative."""
 
+WIDER = (1.0, 100.0, 2000.0)
+"""Factors on the steps of a Hessian's differences, up to a quarter of a posterior sd: the next one
+where the Hessian is not positive definite. A kink of the density, such as that of readings at their
+floor, is a ridge to small steps, and a peak to those across it."""
+
 SETTLED = 1e-2
 """Largest Newton decrement, in posterior sds, of a search that has converged."""
 
@@ -146,11 +151,13 @@ def central_difference_hessian(
     sd: np.ndarray,
     dtype: DTypeLike,
     rows: Sequence[int] | np.ndarray | None = None,
+    *,
+    wider: float = 1.0,
 ) -> np.ndarray:
     """Return rows of the Hessian, all by default, by central differences of the gradient."""
     # With these steps truncation and rounding both stay below 1e-7 of the Hessian (double
     # precision).
-    found, steps = [], _steps(sd, dtype)
+    found, steps = [], wider * _steps(sd, dtype)
     for index, step in zip(range(z.size) if rows is None else rows, steps, strict=True):
         shift = np.zeros_like(z)
         shift[index] = step
@@ -192,10 +199,8 @@ def find_mode(
     z, sd = found.x, np.sqrt(np.abs(np.diagonal(found.hess_inv)))
     for _ in range(6):
         value, gradient = guarded(z)
-        try:
-            hessian = symmetrize(central_difference_hessian(guarded, z, sd, start.dtype))
-            factor = np.linalg.cholesky(hessian)
-        except np.linalg.LinAlgError:
+        factor = _factor_of_hessian(guarded, z, sd, start.dtype)
+        if factor is None:
             unknown = np.full((z.size, z.size), np.nan)
             return Optimum(z, value, np.inf, unknown, ModeStatus.NOT_A_MAXIMUM)
         step = scipy.linalg.cho_solve((factor, True), gradient)
@@ -207,6 +212,17 @@ def find_mode(
         z = z - step
     status = ModeStatus.OK if decrement < SETTLED else ModeStatus.NOT_CONVERGED
     return Optimum(z, float(value), decrement, covariance, status)
+
+
+def _factor_of_hessian(
+    potential: ValueAndGradient, z: np.ndarray, sd: np.ndarray, dtype: DTypeLike
+) -> np.ndarray | None:
+    """Return the Cholesky factor of the Hessian; None where it is not positive definite."""
+    for wider in WIDER:
+        with contextlib.suppress(np.linalg.LinAlgError):
+            hessian = central_difference_hessian(potential, z, sd, dtype, wider=wider)
+            return np.linalg.cholesky(symmetrize(hessian))
+    return None
 
 
 def conditional_normal(

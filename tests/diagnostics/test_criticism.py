@@ -265,7 +265,7 @@ def test_noise_is_a_problem_only_where_it_is_worse_than_its_prior(name, below, l
     [
         (0.1, "note", "scatter 0.0999 times [0.0981, 0.102] their stated errors"),
         (1.0, "passed", ""),
-        (5.0, "caution", "scatter 5 times [4.98, 5.02] their stated errors"),
+        (5.0, "note", "scatter 5 times [4.98, 5.02] their stated errors"),
     ],
 )
 def test_errors_stated_too_large_or_too_small_have_their_own_sentence(factor, level, words) -> None:
@@ -343,3 +343,34 @@ def test_a_reading_within_its_stated_error_is_no_outlier() -> None:
     error = 0.0 * tree["observed_data"]["dop"] + 4.0 * SCALE["dop"]
     tree["constant_data"] = xr.DataTree(constants.assign(dop_error=error))
     assert criticize(tree).loc["outliers", "level"] == "passed"
+
+
+# --- Other parts ----------------------------------------------------------------------------------
+
+FILM = {"part": "nothing", "alternative": "water film", "path": "coat", "defines": []}
+GGX = {"part": "Beckmann", "alternative": "GGX", "path": "surface.distribution", "defines": []}
+
+
+@each(
+    ("other", "name", "times", "shift", "level"),
+    [
+        (GGX, "refractive_index", 2.0, 9.0, "note"),
+        (GGX, "refractive_index", 4.0, 2.5, "caution"),
+        (GGX, "refractive_index", 4.0, 1.5, "passed"),
+        (GGX, "refractive_index", 0.04, 9.0, "passed"),
+        # No reading is evidence of a film: how far off the index would be is what counts.
+        (FILM, "refractive_index", 4.0, 2.5, "note"),
+        (FILM, "refractive_index", 0.2, 4.5, "caution"),
+        (FILM, "refractive_index", 0.04, 4.5, "passed"),
+        (FILM, "subsurface_fraction", 4.0, 2.5, "caution"),
+    ],
+)
+def test_an_undecided_part_is_a_caution_by_its_evidence_or_by_what_it_hides(
+    other, name, times, shift, level
+) -> None:
+    row = {**other, "log_bayes_factor": float(np.log(times)), "shift": {name: [shift]}}
+    found = criticize(edit_provenance(make_result(**SMALL), alternatives=[row]))
+    assert found.loc["alternatives", "level"] == level
+    whose = "the index is that of the outermost interface"
+    is_said = whose in found.loc["alternatives", "sentence"]
+    assert is_said == (other is FILM and level != "passed")

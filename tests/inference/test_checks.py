@@ -7,7 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from polar_bayes.inference.checks import CAUTION, PROBLEM, level, prior_conflict, tail_scores
+from polar_bayes.inference.checks import (
+    CAUTION,
+    MASS_AT_BOUND,
+    PROBLEM,
+    level,
+    prior_conflict,
+    share_at,
+    tail_scores,
+)
 
 ENDS = np.array([-1.0, 1.0, 0.0, -1.0, 0.0])
 
@@ -51,3 +59,13 @@ def test_a_prior_that_excludes_the_median_is_a_conflict_and_finite(below) -> Non
 )
 def test_levels(p_value: float, name: str) -> None:
     assert level(p_value) == name
+
+
+@each(
+    ("density", "is_against"),
+    [(stats.uniform, False), (stats.truncnorm(-1.0, np.inf), False), (stats.halfnorm, True)],
+    ids=["as wide as its prior", "one sd from its peak", "at its peak"],
+)
+def test_a_density_lies_against_a_bound_that_cuts_off_its_peak(density, is_against) -> None:
+    draws = density.ppf((np.arange(100_000) + 0.5) / 100_000)
+    assert (share_at(draws.min(), draws) >= MASS_AT_BOUND) == is_against

@@ -124,3 +124,21 @@ def test_half_of_the_starts_are_the_likeliest_draws() -> None:
     np.testing.assert_array_equal(starts[:4], drawn[np.argsort(values)[:4]])
     others = [z for z in drawn[:8] if not (z == starts[:4]).all(axis=1).any()]
     np.testing.assert_array_equal(starts[4:], others[:4])
+
+
+def test_a_kink_at_a_peak_is_no_saddle() -> None:
+    """A ridge of 2e-3 sds, to steps of 1e-4 a saddle, costs steps of 0.012 this share of curvature.
+
+    The gradient falls by twice the ridge over twice the step: 1 - 0.002 / 0.0122.
+    """
+    ridge = 2e-3
+
+    def potential(z: np.ndarray) -> tuple[float, np.ndarray]:
+        slope = np.array([np.sign(z[0]), 0.0])
+        return float(0.5 * z @ z - ridge * abs(z[0])), z - ridge * slope
+
+    end = find_mode(potential, np.array([0.0, 1.0]))
+    assert end.status is ModeStatus.OK
+    step = 100.0 * np.finfo(float).eps ** 0.25
+    variance = 1.0 / (1.0 - ridge / step)
+    np.testing.assert_allclose(end.covariance, np.diag([variance, 1.0]), rtol=1e-6, atol=1e-6)

@@ -99,10 +99,12 @@ def test_a_wrong_pixel_is_contradicted(errors, kind, check, share):
 
 
 @pytest.mark.thorough
-def test_errors_ten_times_too_small_are_at_the_edge_of_their_prior() -> None:
-    # A factor of ten or more has a prior probability of .0034: a caution, or a problem.
+def test_errors_ten_times_too_small_are_named_where_their_prior_does_not_allow_it() -> None:
     row, _ = row_of("inferred", "errors ten times too small")
-    assert (row["criticism"] & (Criticism.NOISE_CAUTION | Criticism.NOISE_PROBLEM) != 0).all()
+    factor = row["stokes_error_factor_quantile"].sel(quantile=0.5)
+    is_flagged = row["criticism"] & (Criticism.NOISE_CAUTION | Criticism.NOISE_PROBLEM) != 0
+    assert is_flagged.any()
+    assert (is_flagged == (factor > float(pb.PRIORS["stokes_error_factor"].icdf(0.98)))).all()
 
 
 # --- Right ones, and perfect ones -----------------------------------------------------------------
