@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 from arviz_stats.base import array_stats
-from scipy.special import logsumexp
+from scipy.special import expit, logsumexp
 
 from polar_bayes.capture.plausibility import ASSUMED, IndexByEye, index_sentences
 from polar_bayes.diagnostics.alternatives import NOTHING, alternatives
@@ -458,11 +458,11 @@ def _alternatives(fit: FitView, absent: Sequence[Scalar]) -> Finding:
         return judged_by(p_value, highest, sentence, most="caution" if stands_in else "problem")
     layer, factor = table["part"] == NOTHING, table["log_bayes_factor"]
     allowed, favored = factor > LIMITS.refuted, factor > LIMITS.favored
-    # Bodies of any index give the same few under a film: the evidence for one never exceeds a few
-    # times, and decides nothing. What counts is how far from the interval the body's index is.
-    far = table["shift"].abs() > LIMITS.outside + LIMITS.large_difference
+    # Bodies of any index give the same few under a film, so that the evidence for one never exceeds
+    # a few times: it counts by how far it moves the mean over both scenes, at even odds.
+    averaged = (expit(factor) * table["shift"]).abs() > LIMITS.outside
     of_layer = layer & table.index.str.startswith(INDEX)
-    weighty = table["moves"] & favored.mask(of_layer, allowed & far)
+    weighty = table["moves"] & allowed & favored.mask(of_layer, averaged)
     undecided = table[(table["moves"] & allowed) | (layer & favored)]
     if undecided.empty:
         return Finding("passed", p_value, highest)

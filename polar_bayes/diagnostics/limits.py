@@ -17,8 +17,7 @@ class Limits:
     # probability 97.5%.
     large_noise_factor: float = 3.0
     small_noise_factor: float = 1.0 / 3.0
-    # Difference of a posterior mean that counts: without the discrepancy, and from an interval's end
-    # to the answer under an unseen layer.
+    # Difference of a posterior mean without the discrepancy that counts.
     large_difference: float = 1.5
     # Difference of a posterior mean without what is absent up to which it is the same.
     same_mean: float = 0.5

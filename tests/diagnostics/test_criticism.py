@@ -358,10 +358,11 @@ GGX = {"part": "Beckmann", "alternative": "GGX", "path": "surface.distribution",
         (GGX, "refractive_index", 4.0, 2.5, "caution"),
         (GGX, "refractive_index", 4.0, 1.5, "passed"),
         (GGX, "refractive_index", 0.04, 9.0, "passed"),
-        # No reading is evidence of a film: how far off the index would be is what counts.
-        (FILM, "refractive_index", 4.0, 2.5, "note"),
-        (FILM, "refractive_index", 0.2, 4.5, "caution"),
-        (FILM, "refractive_index", 0.04, 4.5, "passed"),
+        # No reading is evidence of a film: what counts is the mean over both, 2/3 * 3 sds away.
+        (FILM, "refractive_index", 2.0, 3.0, "caution"),
+        (FILM, "refractive_index", 2.0, 2.9, "note"),
+        (FILM, "refractive_index", 0.25, 9.9, "caution"),
+        (FILM, "refractive_index", 0.04, 99.0, "passed"),
         (FILM, "subsurface_fraction", 4.0, 2.5, "caution"),
     ],
 )
