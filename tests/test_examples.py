@@ -173,7 +173,8 @@ def every_option(command: click.Command) -> set[str]:
 @of_every_page
 def test_the_options_that_a_page_names_exist(page: Path) -> None:
     option = r"--[a-z][a-z-]*"
-    for code in inline(page):
+    runs = re.findall(r"^python \S+\.py.*", page.read_text(), re.MULTILINE)
+    for code in [*inline(page), *runs]:
         script = re.match(r"python (\S+\.py)", code)
         own = every_option(commands)
         known = re.findall(option, (ROOT / script[1]).read_text()) if script else own
@@ -217,7 +218,7 @@ def test_the_names_of_a_page_exist(page: Path) -> None:
 @of_every_page
 def test_the_paths_of_a_page_exist(page: Path) -> None:
     for code in inline(page):
-        if re.fullmatch(r"(polar_bayes|models|tests|docs|\.ci)/[\w./-]*", code):
+        if re.fullmatch(r"(polar_bayes|models|tests|docs|benchmarks|\.ci)/[\w./-]*", code):
             assert (ROOT / code).exists(), f"{page.name}: {code}"
 
 
