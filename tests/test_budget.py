@@ -15,7 +15,7 @@ CODE = {
     "capture": 834,
     "cli": 1270,
     "design": 1102,
-    "diagnostics": 1869,
+    "diagnostics": 1874,
     "importers": 2098,
     "inference": 2742,
     "maps": 1703,
@@ -27,12 +27,12 @@ CODE = {
     "scenes": 1758,
     "own files": 1583,
     "models": 320,
-    "tests": 22878,
+    "tests": 22882,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25699,
+    "code": 25704,
     "classes": 333,
     "constants": 420,
     "Any": 178,

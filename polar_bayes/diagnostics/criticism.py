@@ -463,11 +463,16 @@ def _alternatives(fit: FitView, absent: Sequence[Scalar]) -> Finding:
     averaged = (expit(factor) * table["shift"]).abs() > LIMITS.outside
     of_layer = layer & table.index.str.startswith(INDEX)
     weighty = table["moves"] & allowed & favored.mask(of_layer, averaged)
-    undecided = table[(table["moves"] & allowed) | (layer & favored)]
-    if undecided.empty:
+    undecided = table[table["moves"] & allowed]
+    if undecided.empty and not (layer & favored).any():
         return Finding("passed", p_value, highest)
-    if undecided["moves"].any():  # what stays is no other answer
-        undecided = undecided[undecided["moves"]]
+    if undecided.empty:  # what explains the readings better, but is no other answer
+        seen = table[layer & favored].sort_values("log_bayes_factor").iloc[-1]
+        sentence = (
+            f"The readings favor {_swap_text(seen['alternative'], NOTHING)}, by a Bayes factor of "
+            f"{math.exp(seen['log_bayes_factor']):.2g}; the answer is the same with it."
+        )
+        return Finding("note", p_value, highest, sentence)
     answers = [
         f"{label} is {row['other']:.3g}, {abs(row['shift']):.1f} sd away, with "
         + _swap_text(row["alternative"], row["part"])
@@ -476,7 +481,7 @@ def _alternatives(fit: FitView, absent: Sequence[Scalar]) -> Finding:
     whose = "; the index is that of the outermost interface, which under a film is the film's"
     sentence = (
         f"The answer rests on a part that the readings do not decide: {listed(answers)}"
-        f"{whose * bool(undecided['part'].eq(NOTHING).any())}; unless "
+        f"{whose * bool(undecided['alternative'].str.contains('film').any())}; unless "
         "you know the part, report both answers, as polar_bayes.compare_scenes gives them."
     )
     return Finding("caution" if weighty.any() else "note", p_value, highest, sentence)

@@ -364,6 +364,8 @@ GGX = {"part": "Beckmann", "alternative": "GGX", "path": "surface.distribution",
         (FILM, "refractive_index", 0.25, 9.9, "caution"),
         (FILM, "refractive_index", 0.04, 99.0, "passed"),
         (FILM, "subsurface_fraction", 4.0, 2.5, "caution"),
+        (FILM, "refractive_index", 4.0, 1.5, "note"),
+        (FILM, "refractive_index", 2.0, 1.5, "passed"),
     ],
 )
 def test_an_undecided_part_is_a_caution_by_its_evidence_or_by_what_it_hides(
@@ -372,6 +374,7 @@ def test_an_undecided_part_is_a_caution_by_its_evidence_or_by_what_it_hides(
     row = {**other, "log_bayes_factor": float(np.log(times)), "shift": {name: [shift]}}
     found = criticize(edit_provenance(make_result(**SMALL), alternatives=[row]))
     assert found.loc["alternatives", "level"] == level
-    whose = "the index is that of the outermost interface"
-    is_said = whose in found.loc["alternatives", "sentence"]
-    assert is_said == (other is FILM and level != "passed")
+    sentence = found.loc["alternatives", "sentence"]
+    moves, is_film = abs(shift) > 1.96, other is FILM and level != "passed"
+    assert ("the index is that of the outermost interface" in sentence) == (is_film and moves)
+    assert ("the answer is the same with it" in sentence) == (is_film and not moves)
