@@ -15,7 +15,7 @@ CODE = {
     "capture": 834,
     "cli": 1270,
     "design": 1102,
-    "diagnostics": 1874,
+    "diagnostics": 1872,
     "importers": 2098,
     "inference": 2742,
     "maps": 1703,
@@ -32,7 +32,7 @@ CODE = {
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25704,
+    "code": 25702,
     "classes": 333,
     "constants": 420,
     "Any": 178,

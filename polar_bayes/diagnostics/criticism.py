@@ -248,22 +248,20 @@ def _noise(fit: FitView) -> Finding:
     least = "passed"
     is_assumed = (fit.provenance.get("capture") or {}).get("errors") == ASSUMED
     errors = f"the errors that were {ASSUMED}" if is_assumed else "their stated errors"
+    # The fit takes the factor for what it is; beyond what its prior allows it is a caution.
     for scalar in (s for s in noise if s.name == NOISE_FACTOR):
         low, high = np.quantile(scalar.draws, CENTRAL_95)
-        factor = f"{np.median(scalar.draws):.3g} times [{low:.3g}, {high:.3g}] {errors}"
-        # The fit takes the factor for what it is; beyond what its prior allows it is a caution.
+        why = ""
         if low > LIMITS.large_noise_factor:
-            least = "note"
-            sentence = (
-                f"The readings scatter {factor}: these errors are too small, or the scene "
-                "lacks what the readings show; check the errors, or try polar_bayes.compare_scenes."
+            why = (
+                "these errors are too small, or the scene lacks what the readings show; check the "
+                "errors, or try polar_bayes.compare_scenes"
             )
         elif high < LIMITS.small_noise_factor:
-            least = "note"
-            sentence = (
-                f"The readings scatter {factor}: these errors are too large, and the fit "
-                "takes the readings to be as precise as they are."
-            )
+            why = "these errors are too large, and the fit takes the readings to be that precise"
+        if why:
+            least, factor = "note", f"{np.median(scalar.draws):.3g} times [{low:.3g}, {high:.3g}]"
+            sentence = f"The readings scatter {factor} {errors}: {why}."
     return judged_by(p_value, math.nan, sentence, least=least)
 
 
