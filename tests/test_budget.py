@@ -23,16 +23,16 @@ CODE = {
     "numerics": 1006,
     "observation": 511,
     "physics": 2760,
-    "reporting": 3261,
+    "reporting": 3267,
     "scenes": 1758,
     "own files": 1583,
     "models": 320,
-    "tests": 22882,
+    "tests": 22893,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25702,
+    "code": 25708,
     "classes": 333,
     "constants": 420,
     "Any": 178,

@@ -108,8 +108,8 @@ def fit_page(result: xr.DataTree | FitView) -> page.Page:
     answers: list[str] = []
     sentences: list[str] = []
     if judged.passed:
-        further = [text.next_sentence(fit.result), *text.setup_beside_views(fit)]
-        answers = [" ".join(text.index_sentences(fit)), text.trust(fit), " ".join(further)]
+        further = " ".join(text.next_sentences(fit))
+        answers = [" ".join(text.index_sentences(fit)), text.trust(fit), further]
         sentences = [*text.determined(fit), *text.between_members(fit)]
     approximation = "Convergence" if fit.method == "nuts" else "Approximation"
     code = str(fit.provenance.get("model_source") or "")

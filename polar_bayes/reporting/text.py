@@ -345,7 +345,7 @@ def index_sentences(fit: FitView) -> list[str]:
     return [f"The refractive index n is {join(phrases)}."]
 
 
-def next_sentence(result: xr.DataTree) -> str:
+def _views_sentence(result: xr.DataTree) -> str:
     """State what to measure next, if the result holds `polar_bayes.next_views`."""
     if "next_views" not in result.children:
         return (
@@ -355,10 +355,7 @@ def next_sentence(result: xr.DataTree) -> str:
     found = result["next_views"].to_dataset()
     views = verdict(found).sentences[0].rstrip(".").replace("Look next", "Measure next")
     limits = "".join(f" {each}" for each in limits_sentences(found))
-    widths = found["interval_width"].transpose("step", "parameter").to_pandas()
-    of_index = widths.filter(like="refractive_index")
-    before, after = (of_index if of_index.size else widths).iloc[[0, -1]].to_numpy()
-    of = " of n" if of_index.size else ""
+    of, before, after = _expected_widths(found)
     share = 1.0 - after / before
     if share.max() < SMALL_GAIN:
         return f"{views}: but 95% intervals{of} narrow by {percent(share.max())} at most.{limits}"
@@ -372,15 +369,27 @@ def next_sentence(result: xr.DataTree) -> str:
     return f"{views}: the 95% intervals{of} are expected to narrow by {by}.{limits}"
 
 
-def setup_beside_views(fit: FitView) -> list[str]:
-    """State what better knowledge of the set-up does for n, if it matters."""
+def _expected_widths(views: xr.Dataset) -> tuple[str, np.ndarray, np.ndarray]:
+    """Return ` of n` and its 95% widths before and after views; those of all where n is known."""
+    widths = views["interval_width"].transpose("step", "parameter").to_pandas()
+    of_index = widths.filter(like="refractive_index")
+    before, after = (of_index if of_index.size else widths).iloc[[0, -1]].to_numpy()
+    return " of n" * bool(of_index.size), before, after
+
+
+def next_sentences(fit: FitView) -> list[str]:
+    """State what to measure next and what to know better: first what narrows n more."""
+    sentences = [_views_sentence(fit.result)]
     wider = wider_by_setup(fit).filter(like="refractive_index")
     if "next_views" not in fit.result.children or wider.empty:
-        return []
+        return sentences
     label = str(wider.index[0])
     (what, sd), now = better_known(fit, label), budget(fit).loc[label, "sd"]
-    by = f"{1.0 - sd / now:.0%}"
-    return [f"Without further views, the {what} narrows the 95% interval of {label} by {by}."]
+    share, by_views = 1.0 - sd / now, _expected_widths(fit.result["next_views"].to_dataset())
+    known = f"the {what} narrows the 95% interval of {label} by {share:.0%}."
+    first = share > np.max(1.0 - by_views[2] / by_views[1])
+    sentences.insert(0 if first else 1, f"Without further views, {known}")
+    return sentences
 
 
 def trust(fit: FitView) -> str:

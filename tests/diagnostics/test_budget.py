@@ -22,7 +22,7 @@ from polar_bayes.physics.input_quantities import (
     ToneCurve,
     ViewZenithScale,
 )
-from polar_bayes.reporting.text import setup_beside_views
+from polar_bayes.reporting.text import next_sentences
 from polar_bayes.setups import Setup
 
 KNOWN = {"sample_lean": 0.2, "view_zenith_scale": 0.002, "tone_curve": 0.02}
@@ -169,16 +169,27 @@ def test_what_only_adds_is_known_to_its_standard_deviation(capture: xr.Dataset) 
     assert type(prior) is type(pb.PRIORS["ambient_light_offset"])
 
 
-def test_what_to_know_better_stands_beside_further_views(fit: xr.DataTree) -> None:
+@each(("width", "place"), [(0.99, 0), (0.01, 1)], ids=["views help less", "views help more"])
+def test_what_to_know_better_stands_beside_further_views(fit, width, place) -> None:
     told = fit.copy()
-    told["next_views"] = xr.Dataset()
+    told["next_views"] = xr.Dataset(
+        {
+            "interval_width": (("step", "parameter"), [[1.0], [width]]),
+            **{name: ("pick", [70.0]) for name in ("view_zenith", "light_zenith")},
+            **{name: ("pick", [180.0]) for name in ("view_azimuth", "light_azimuth")},
+        },
+        coords={"parameter": ["refractive_index"]},
+    )
     now, half = pb.budget(fit), pb.budget(fit, known={"tone_curve": 0.01})
     share = 1.0 - half.loc["refractive_index", "sd"] / now.loc["refractive_index", "sd"]
-    assert setup_beside_views(view_of(told)) == [
+    assert 0.01 < share < 0.99
+    sentences = next_sentences(view_of(told))
+    assert sentences[place] == (
         "Without further views, the exponent of the sensor's tone curve known to 0.01 instead of "
         f"0.02 narrows the 95% interval of refractive_index by {share:.0%}."
-    ]
-    assert setup_beside_views(view_of(fit)) == []
+    )
+    assert sentences[1 - place].startswith("Measure next at zenith 70, azimuth 180: ")
+    assert len(next_sentences(view_of(fit))) == 1
 
 
 @each(
