@@ -27,7 +27,7 @@ CODE = {
     "scenes": 1758,
     "own files": 1583,
     "models": 320,
-    "tests": 22893,
+    "tests": 22894,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 

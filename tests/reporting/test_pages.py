@@ -230,11 +230,13 @@ CARDS: dict[str, Callable[[], object]] = {
 
 def cards() -> list[str]:
     """The lines of every card."""
-    return [
+    lines = [
         line
         for name, make in CARDS.items()
         for line in (f"--- {name}", *repr(pb.show(make())).splitlines())
     ]
+    # The third digit of R-hat is that of the processor: rounding swaps ranks of some of 30 draws.
+    return [re.sub(r"(1\.\d\d)\d(?=,| and)", r"\1", line) for line in lines]
 
 
 def test_a_card_says_what_was_approved() -> None:
