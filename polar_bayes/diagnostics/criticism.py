@@ -455,22 +455,22 @@ def _alternatives(fit: FitView, absent: Sequence[Scalar]) -> Finding:
         stands_in = part == NOTHING and not moves.any()
         return judged_by(p_value, highest, sentence, most="caution" if stands_in else "problem")
     layer, factor = table["part"] == NOTHING, table["log_bayes_factor"]
-    allowed, favored = factor > LIMITS.refuted, factor > LIMITS.favored
+    moving, favored = table["moves"] & (factor > LIMITS.refuted), factor > LIMITS.favored
+    undecided, seen = table[moving], table[layer & favored]
+    if undecided.empty and seen.empty:
+        return Finding("passed", p_value, highest)
+    if undecided.empty:  # what explains the readings better, but is no other answer
+        best = seen.sort_values("log_bayes_factor").iloc[-1]
+        sentence = (
+            f"The readings favor {_swap_text(best['alternative'], NOTHING)}, by a Bayes factor of "
+            f"{math.exp(best['log_bayes_factor']):.2g}; the answer is the same with it."
+        )
+        return Finding("note", p_value, highest, sentence)
     # Bodies of any index give the same few under a film, so that the evidence for one never exceeds
     # a few times: it counts by how far it moves the mean over both scenes, at even odds.
     averaged = (expit(factor) * table["shift"]).abs() > LIMITS.outside
     of_layer = layer & table.index.str.startswith(INDEX)
-    weighty = table["moves"] & allowed & favored.mask(of_layer, averaged)
-    undecided = table[table["moves"] & allowed]
-    if undecided.empty and not (layer & favored).any():
-        return Finding("passed", p_value, highest)
-    if undecided.empty:  # what explains the readings better, but is no other answer
-        seen = table[layer & favored].sort_values("log_bayes_factor").iloc[-1]
-        sentence = (
-            f"The readings favor {_swap_text(seen['alternative'], NOTHING)}, by a Bayes factor of "
-            f"{math.exp(seen['log_bayes_factor']):.2g}; the answer is the same with it."
-        )
-        return Finding("note", p_value, highest, sentence)
+    weighty = moving & favored.mask(of_layer, averaged)
     answers = [
         f"{label} is {row['other']:.3g}, {abs(row['shift']):.1f} sd away, with "
         + _swap_text(row["alternative"], row["part"])

@@ -385,10 +385,10 @@ def next_sentences(fit: FitView) -> list[str]:
         return sentences
     label = str(wider.index[0])
     (what, sd), now = better_known(fit, label), budget(fit).loc[label, "sd"]
-    share, by_views = 1.0 - sd / now, _expected_widths(fit.result["next_views"].to_dataset())
+    share, (_, before, after) = 1.0 - sd / now, _expected_widths(fit.result["next_views"].dataset)
     known = f"the {what} narrows the 95% interval of {label} by {share:.0%}."
-    first = share > np.max(1.0 - by_views[2] / by_views[1])
-    sentences.insert(0 if first else 1, f"Without further views, {known}")
+    helps_more = share > np.max(1.0 - after / before)
+    sentences.insert(0 if helps_more else 1, f"Without further views, {known}")
     return sentences
 
 
