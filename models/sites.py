@@ -15,8 +15,10 @@ from numpyro.distributions.transforms import Transform
 
 from polar_bayes.observation.data import Observations
 from polar_bayes.observation.links import AbstractLink, noise_parameters
-from polar_bayes.physics.part import UNPOLARIZED
+from polar_bayes.physics.part import UNPOLARIZED, at_least
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
+from polar_bayes.physics.stokes import Light
+from polar_bayes.priors import CONTRAST, Metered
 
 Priors = Mapping[str, dist.Distribution]
 Links = Mapping[str, AbstractLink]
@@ -152,8 +154,6 @@ def declare_readings(
     # The instrument and the noise: one value for the whole capture, shared by all its patches.
     rest = [name for name in scene.parameters if name not in parameters]
     instrument = {name: _sample(name, priors[name]) for name in rest}
-    noise = {name: numpyro.sample(name, priors[name]) for name in noise_parameters(links)}
-
     parameters = {**parameters, **instrument}
     if scene.dispersion is not None and data.geometry.wavelength is not None:
         # The coefficients of the law are sampled; the index is deterministic.
@@ -163,9 +163,28 @@ def declare_readings(
             numpyro.deterministic("refractive_index", index[..., None])
 
     # Readings without noise (eq. 1), and the likelihood.
-    prediction = scene.predict(parameters | noise, data.geometry)
+    light = scene.arriving(parameters, data.geometry)
+    noise = {name: _draw_noise(name, priors, light, data) for name in noise_parameters(links)}
+    prediction = scene.record(parameters | noise, data.geometry, light)
     with over_axes(data):
         for name, link in links.items():
             numpyro.deterministic(f"{name}_mean", link.center(name, prediction, noise))
             likelihood = link.distribution(name, prediction, data, noise).mask(data.fitted(name))
             numpyro.sample(name, likelihood, obs=link.reading(data.readings[name]))
+
+
+def _draw_noise(name: str, priors: Priors, light: Light, data: Observations) -> Array:
+    """Sample a parameter of the noise, or the level from which an exposure follows."""
+    if not isinstance(priors[name], Metered):
+        return numpyro.sample(name, priors[name])
+    level = numpyro.sample(f"{name}_level", priors[f"{name}_level"])
+    return numpyro.deterministic(name, level * jnp.exp(-_log_average(light, data)))
+
+
+def _log_average(light: Light, data: Observations) -> Array:
+    """Return the mean log intensity of the measured views, black ones included."""
+    metered = data.valid & data.is_measured
+    seen = jnp.broadcast_to(light.intensity, data.shape)
+    dark = jnp.max(seen, where=metered, initial=0.0) / CONTRAST
+    logs = jnp.log(at_least(seen + dark, float(jnp.finfo(seen.dtype).tiny)))
+    return jnp.sum(logs, where=metered) / jnp.maximum(jnp.sum(metered), 1)

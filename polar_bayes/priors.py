@@ -265,6 +265,30 @@ class NormalScoreToPower(transforms.Transform):
         return -odds if self.falls else odds
 
 
+# --- The prior of an exposure ---------------------------------------------------------------------
+
+CONTRAST = 1e4
+"""Largest ratio of intensities in a capture for which an exposure is set: outside its highlight a
+bare mirror is darker, and nobody exposes for that."""
+
+
+class Metered(dist.LogNormal):
+    """Log-normal prior of an exposure that was set by a meter for the light of the capture.
+
+    Where the light of all its views is known to a model, it samples the share of full scale at
+    which their log-average is recorded, `exposure_level`, and the exposure follows. Readings tell
+    that share, whatever the material, so that chains take long steps.
+
+    Source:
+        Reinhard, Stark, Shirley and Ferwerda 2002, "Photographic tone reproduction for digital
+        images", ACM Trans. Graph. 21(3), 267-276, eq. 1 and 2: the log-average at a share of .18.
+    """
+
+    @override
+    def cdf(self, value: ArrayLike) -> Array:
+        raise NotImplementedError("it depends on the light")
+
+
 # --- Priors that come from other pixels -----------------------------------------------------------
 
 
@@ -312,7 +336,7 @@ def parse_prior(text: object, where: str) -> dist.Distribution:
 
     Args:
         text: As `prior_text` writes it, or as it stands in a program. `HalfNormal` and `Beta` are
-            those of this file, which have the same densities.
+            those of this file, which have the same densities, and so is `Metered`.
         where: Where the text is, for the message of an error.
 
     Raises:
@@ -411,7 +435,7 @@ def _components(prior: Mixture) -> Sequence[dist.Distribution]:
 def _distributions() -> Mapping[str, Callable[..., object]]:
     """Return what the text of a prior may name: NumPyro's distributions and transforms."""
     names = (name for name in dist.__all__ if name[:1].isupper())
-    own = {"HalfNormal": HalfNormal, "Beta": Beta}
+    own = {"HalfNormal": HalfNormal, "Beta": Beta, "Metered": Metered}
     known = {name: getattr(dist, name) for name in names} | own
     known |= {name: getattr(transforms, name) for name in transforms.__all__ if name[:1].isupper()}
     return {name: _with_arrays(made) for name, made in known.items()}
@@ -537,7 +561,8 @@ _ROWS: dict[str, dist.Distribution] = {
     "stokes_scale": dist.LogNormal(math.log(0.01), 1.0),
     "stokes_error_factor": dist.LogNormal(math.log(1.5), 0.7),
     # Bodies under unit irradiance come near full scale at exposures of 5 to 15.
-    "exposure": dist.LogNormal(math.log(7.0), 3.0),
+    "exposure": Metered(math.log(7.0), 3.0),
+    "exposure_level": dist.LogNormal(math.log(0.18), 1.5),
     "intensity_scale": dist.LogNormal(math.log(0.02), 1.0),
 }
 

@@ -37,7 +37,7 @@ from polar_bayes.physics.instrument import (
 )
 from polar_bayes.physics.part import notation
 from polar_bayes.physics.scene import Scene
-from polar_bayes.priors import PRIORS, RANGES
+from polar_bayes.priors import CONTRAST, PRIORS, RANGES
 from polar_bayes.setups import SETUPS, Setup, find_setup, setup_name
 
 __all__ = ["PRESETS", "Material", "MirrorScan", "Protocol"]
@@ -441,19 +441,19 @@ def _record(
     key_intensity, key_rest = jax.random.split(jax.random.key(seed))
     axes = len(layout.shape)
     parameters = {name: _align_image(x, axes - 1) for name, x in truth.items()}
-    alone = scene.predict(parameters | {"exposure": jnp.inf}, layout.geometry)  # no ambient light
-    light = jnp.broadcast_to(alone["intensity"], layout.shape)
+    arriving = scene.arriving(parameters, layout.geometry)
+    unlit = parameters | {"exposure": jnp.inf}  # no ambient light
+    alone = scene.record(unlit, layout.geometry, arriving)["intensity"]
+    light = jnp.broadcast_to(alone, layout.shape)
     # Outside its highlight a bare mirror is black: no camera exposes for what is left of a lobe
-    # there, so that the brightest view sets the exposure if its contrast is larger than 1e4.
-    bright = jnp.maximum(jnp.quantile(light, BRIGHT_QUANTILE), jnp.max(light) / 1e4)
+    # there, so that the brightest view sets the exposure if the contrast is larger.
+    bright = jnp.maximum(jnp.quantile(light, BRIGHT_QUANTILE), jnp.max(light) / CONTRAST)
     exposure = BRIGHT_LEVEL / bright
     chosen = {name: exposure if level is None else level for name, level in noise.items()}
     levels = {name: _align_image(level, axes) for name, level in chosen.items()}
     if "exposure" in chosen:
         parameters["exposure"] = _align_image(chosen["exposure"], axes - 1)
-    prediction = alone  # only an instrument knows of the exposure
-    if scene.instrument is not None:
-        prediction = scene.predict(parameters, layout.geometry)
+    prediction = scene.record(parameters, layout.geometry, arriving)
     prediction = {n: jnp.broadcast_to(x, layout.shape) for n, x in prediction.items()}
     recorded: dict[str, Array] = {}
     data = layout

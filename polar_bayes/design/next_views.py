@@ -244,7 +244,7 @@ def _extended(
     recorded = recorded[..., : views.measured]
     rest = np.full((*data.shape[:-1], data.shape[-1] - views.measured), np.median(recorded))
     brightness = jax.device_put(np.concatenate([recorded, rest], axis=-1))
-    data = dataclasses.replace(data, brightness=brightness)
+    data = dataclasses.replace(data, brightness=brightness, views=jnp.int32(views.measured))
     compiled_model = compile_model(request, data)
     data, program, prior = compiled_model.free(data), compiled_model.program, problem.prior
     for name in (name for name in new if name not in program.observed):

@@ -518,9 +518,14 @@ def inspect_model(parts: ModelParts, data: Observations) -> ModelInfo:
 
 
 def _check_handlers(model: Callable, sites: tuple[str, ...]) -> None:
-    """Refuse `substitute` and `do`, which fix values in simulations but not in fits."""
+    """Refuse handlers that fix values in simulations but not in fits, or that name no site."""
     while isinstance(model, Messenger):
-        held = [name for name in getattr(model, "data", None) or {} if name in sites]
+        named = tuple(getattr(model, "data", None) or {})
+        unknown = [name for name in named if name not in sites]
+        if isinstance(model, handlers.condition) and unknown:
+            what, hint = f"it has no site {unknown[0]}", f"hold one of {', '.join(sites)}"
+            raise FitError(what, where="model", hint=hint)
+        held = [name for name in named if name in sites]
         if isinstance(model, handlers.substitute | handlers.do) and held:
             raise FitError(
                 f"{type(model).__name__} does not hold {held[0]} while the posterior is sampled",

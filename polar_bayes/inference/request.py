@@ -124,6 +124,9 @@ def resolve(
     PriorTable(priors)  # refuses what names no priors
     given = dict(priors or {})
     usual = default_priors(setup, capture, known)
+    if is_perfect:  # the other pixels have most of the light for which an image is exposed
+        exposure = PRIORS["exposure"]
+        usual = {"exposure": dist.LogNormal(exposure.loc, exposure.scale), **usual}
     same = {n: x for n, x in {**PRIORS, **usual}.items() if _are_same(given.get(n), x)}
     own = {name: prior for name, prior in given.items() if name not in same}
     stated = {**usual, **own, **same}

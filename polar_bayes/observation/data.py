@@ -39,8 +39,8 @@ class Observations(eqx.Module):
             that other pixels determine too; they replace the priors of those names.
         held: Values of latent sites that are not estimated, in their supports, NaN where one is;
             a site that is not among them is estimated.
-        views: How many views the capture has; those beyond are padding, never valid. None where
-            there is no padding.
+        views: How many views the capture has; those beyond are padding, never valid, or candidates
+            for which no exposure was set. None where there are no others.
     """
 
     geometry: Geometry
@@ -77,6 +77,12 @@ class Observations(eqx.Module):
     def measured(self) -> slice:
         """The views of the capture, along the last axis."""
         return slice(None if self.views is None else int(self.views))
+
+    @property
+    def is_measured(self) -> Bool[Array, " view"]:
+        """True for the views of the capture."""
+        count = self.shape[-1]
+        return jnp.arange(count) < (count if self.views is None else self.views)
 
     def in_single_precision(self) -> "Observations":
         """Return the readings as 32-bit numbers; masks are unchanged."""

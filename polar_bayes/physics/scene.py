@@ -178,12 +178,44 @@ class Scene(HTMLRepr):
         Raises:
             SceneError: A parameter that the scene reads is missing.
         """
-        names = *self.parameters, *(("exposure",) if "exposure" in parameters else ())
-        per_view = self._per_view(parameters, names, geometry)
-        if self.instrument is None:
-            light = self._optics(per_view, geometry)
-        else:
-            light = self._optics(per_view, self.instrument.aim(per_view, geometry))
+        return self.record(parameters, geometry, self.arriving(parameters, geometry))
+
+    def arriving(self, parameters: Mapping[str, ArrayLike], geometry: Geometry) -> Light:
+        """Return the light that reaches the instrument, in the directions that it really has.
+
+        Args:
+            parameters: As `predict` takes them.
+            geometry: Directions as read off. Shape (..., view), degree.
+
+        Returns:
+            Light of shape (..., view).
+
+        Raises:
+            SceneError: A parameter that the scene reads is missing.
+        """
+        per_view = self._per_view(parameters, self.parameters, geometry)
+        true = geometry if self.instrument is None else self.instrument.aim(per_view, geometry)
+        return self._optics(per_view, true)
+
+    def record(
+        self, parameters: Mapping[str, ArrayLike], geometry: Geometry, light: Light
+    ) -> dict[str, Array]:
+        """Return readings, without noise, of the light that reaches the instrument.
+
+        Args:
+            parameters: As `predict` takes them.
+            geometry: Directions as read off. Shape (..., view), degree.
+            light: As `arriving` returns it. Shape (..., view).
+
+        Returns:
+            As `predict` returns them.
+
+        Raises:
+            SceneError: A parameter that the scene reads is missing.
+        """
+        if self.instrument is not None:
+            names = *self.parameters, *(("exposure",) if "exposure" in parameters else ())
+            per_view = self._per_view(parameters, names, geometry)
             light = self.instrument.record(per_view, geometry, light)
         intensity, q, u = jnp.broadcast_arrays(*light)
         dop = degree_of_linear_polarization(q, u)
