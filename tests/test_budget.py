@@ -17,24 +17,24 @@ CODE = {
     "design": 1102,
     "diagnostics": 1872,
     "importers": 2098,
-    "inference": 2742,
+    "inference": 2750,
     "maps": 1703,
     "methods": 1265,
     "numerics": 1006,
-    "observation": 511,
-    "physics": 2760,
+    "observation": 515,
+    "physics": 2766,
     "reporting": 3267,
     "scenes": 1758,
-    "own files": 1583,
-    "models": 320,
-    "tests": 22894,
+    "own files": 1589,
+    "models": 332,
+    "tests": 22969,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25708,
-    "classes": 333,
-    "constants": 420,
+    "code": 25744,
+    "classes": 334,
+    "constants": 421,
     "Any": 178,
     "longest function": 80,
 }
@@ -42,8 +42,9 @@ WHOLE = {
 
 The plan was 20,500 lines of code, 290 classes and 180 `Any`, for a package that had 23,938 lines.
 Since then features came that were chosen over it: readers of other people's files (900 lines),
-the set-up in the interval (210), a map to point at (290), second bounces and passages (220) and
-programs on the disk (90). The other rooms became smaller by a few lines only.
+the set-up in the interval (210), a map to point at (290), second bounces and passages (220),
+programs on the disk (90), and exposures that are set for the light (40). The other rooms became
+smaller by a few lines only.
 """
 
 

@@ -14,6 +14,7 @@ from synthetic_results import make_result
 
 import polar_bayes as pb
 from polar_bayes.design.optimal_design import fedorov_exchange
+from polar_bayes.simulation import Protocol
 
 START = np.array([40.0, 50.0])
 GRID = np.linspace(10.0, 80.0, 8)
@@ -230,6 +231,18 @@ def test_another_reading_can_be_added_even_at_the_ends(plate: xr.Dataset) -> Non
     assert np.isfinite(found["expected_sd"]).all()
     assert (np.diff(found["criterion"]) < 0.0).all()
     assert pb.verdict(found).sentences[0].count(", intensity") == 3
+
+
+@pytest.mark.thorough
+def test_views_that_are_not_taken_change_nothing() -> None:
+    """What the capture alone tells: no exposure was set for the light of candidates."""
+    capture = pb.simulate("plastic", protocol=Protocol(views=10, wavelengths=()), seed=0)
+    fit = pb.fit(capture, method="laplace")
+    sd = [
+        pb.next_views(fit, angles(zeniths), count=1, draws=4)["expected_sd"][0]
+        for zeniths in ([44.0, 45.0, 46.0], [1.0, 2.0, 80.0])
+    ]
+    np.testing.assert_allclose(*sd, rtol=1e-9)
 
 
 @pytest.mark.thorough
