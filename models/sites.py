@@ -174,11 +174,11 @@ def declare_readings(
 
 
 def _draw_noise(name: str, priors: Priors, light: Light, data: Observations) -> Array:
-    """Sample a parameter of the noise, or the level from which an exposure follows."""
+    """Sample a parameter of the noise, or the share from which an exposure follows."""
     if not isinstance(priors[name], Metered):
         return numpyro.sample(name, priors[name])
-    level = numpyro.sample(f"{name}_level", priors[f"{name}_level"])
-    return numpyro.deterministic(name, level * jnp.exp(-_log_average(light, data)))
+    share = numpyro.sample(f"{name}_share", priors[f"{name}_share"])
+    return numpyro.deterministic(name, share * jnp.exp(-_log_average(light, data)))
 
 
 def _log_average(light: Light, data: Observations) -> Array:

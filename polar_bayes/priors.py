@@ -276,7 +276,7 @@ class Metered(dist.LogNormal):
     """Log-normal prior of an exposure that was set by a meter for the light of the capture.
 
     Where the light of all its views is known to a model, it samples the share of full scale at
-    which their log-average is recorded, `exposure_level`, and the exposure follows. Readings tell
+    which their log-average is recorded, `exposure_share`, and the exposure follows. Readings tell
     that share, whatever the material, so that chains take long steps.
 
     Source:
@@ -562,7 +562,7 @@ _ROWS: dict[str, dist.Distribution] = {
     "stokes_error_factor": dist.LogNormal(math.log(1.5), 0.7),
     # Bodies under unit irradiance come near full scale at exposures of 5 to 15.
     "exposure": Metered(math.log(7.0), 3.0),
-    "exposure_level": dist.LogNormal(math.log(0.18), 1.5),
+    "exposure_share": dist.LogNormal(math.log(0.18), 1.5),
     "intensity_scale": dist.LogNormal(math.log(0.02), 1.0),
 }
 

@@ -123,10 +123,7 @@ def resolve(
     function = model if callable(model) else _find_model(model)
     PriorTable(priors)  # refuses what names no priors
     given = dict(priors or {})
-    usual = default_priors(setup, capture, known)
-    if is_perfect:  # the other pixels have most of the light for which an image is exposed
-        exposure = PRIORS["exposure"]
-        usual = {"exposure": dist.LogNormal(exposure.loc, exposure.scale), **usual}
+    usual = (_of_a_pixel() if is_perfect else {}) | default_priors(setup, capture, known)
     same = {n: x for n, x in {**PRIORS, **usual}.items() if _are_same(given.get(n), x)}
     own = {name: prior for name, prior in given.items() if name not in same}
     stated = {**usual, **own, **same}
@@ -164,6 +161,12 @@ def resolve(
         shared=tuple(name for name in setup.shared if name in found.priors),
         perfect=tuple(each.name for each in acting) if is_perfect else (),
     )
+
+
+def _of_a_pixel() -> dict[str, dist.Distribution]:
+    """Return priors that differ in a map: an image is not exposed for the light of one pixel."""
+    exposure = PRIORS["exposure"]
+    return {"exposure": dist.LogNormal(exposure.loc, exposure.scale)}
 
 
 def _check_settings(limit: float, precision: str, seed: int) -> None:

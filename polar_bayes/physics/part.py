@@ -219,7 +219,7 @@ NOTATION: dict[str, Quantity] = {
     "stokes_scale": Quantity("", "noise of q and u in full light"),
     "stokes_error_factor": Quantity("", "true errors of q and u over those in the capture"),
     "exposure": Quantity("", "recorded over predicted intensity"),
-    "exposure_level": Quantity("", "log-average of the light on the scale of the sensor"),
+    "exposure_share": Quantity("", "log-average of the light on the scale of the sensor"),
     "intensity_scale": Quantity("", "noise of the intensity"),
 }
 

@@ -1,4 +1,4 @@
-"""An exposure is set for the light of its capture: its level is sampled, and it follows."""
+"""An exposure is set for the light of its capture: its share of full scale is sampled."""
 
 import dataclasses
 
@@ -54,16 +54,16 @@ def log_average(prior: dict[str, np.ndarray], angles: dict[str, np.ndarray]) -> 
     return np.log(seen + seen.max(axis=-1, keepdims=True) / CONTRAST).mean(axis=-1)
 
 
-def test_the_log_average_is_recorded_at_the_level(prior: dict[str, np.ndarray]) -> None:
+def test_the_log_average_is_recorded_at_the_share(prior: dict[str, np.ndarray]) -> None:
     found = np.log(prior["exposure"]) + log_average(prior, VIEWS.angles())
     # In single precision, of intensities whose logs reach 25.
-    np.testing.assert_allclose(found, np.log(prior["exposure_level"]), atol=1e-4)
+    np.testing.assert_allclose(found, np.log(prior["exposure_share"]), atol=1e-4)
 
 
-def test_the_level_is_a_photographers(prior: dict[str, np.ndarray]) -> None:
+def test_the_share_is_a_photographers(prior: dict[str, np.ndarray]) -> None:
     expected = stats.norm(np.log(0.18), 1.5)
     # False alarms: 1 in 10,000.
-    assert stats.kstest(np.log(prior["exposure_level"]), expected.cdf).pvalue > 1e-4
+    assert stats.kstest(np.log(prior["exposure_share"]), expected.cdf).pvalue > 1e-4
 
 
 @pytest.mark.thorough
@@ -73,21 +73,21 @@ def test_a_view_that_is_missing_sets_no_exposure(
     masked = capture.assign(valid=("view", np.arange(12) < 10))
     found = prior_of(masked)
     shown = {name: x[:10] for name, x in VIEWS.angles().items()}
-    np.testing.assert_array_equal(found["exposure_level"], prior["exposure_level"])
+    np.testing.assert_array_equal(found["exposure_share"], prior["exposure_share"])
     ratio = np.log(found["exposure"]) + log_average(found, shown)
-    np.testing.assert_allclose(ratio, np.log(found["exposure_level"]), atol=1e-4)
+    np.testing.assert_allclose(ratio, np.log(found["exposure_share"]), atol=1e-4)
 
 
 def test_an_exposure_that_is_known_has_a_prior_of_its_own(capture: xr.Dataset) -> None:
     fit = pb.fit(capture, scene="paper", priors=FREE, method="laplace")
-    assert "exposure_level" not in fit["posterior"]
+    assert "exposure_share" not in fit["posterior"]
     assert np.log(fit["prior"]["exposure"].to_numpy()).mean() == pytest.approx(2.0, abs=0.2)
     held = pb.fit(capture, scene="paper", priors=FREE, method="laplace", model=HELD)
     assert "exposure" not in held["posterior"]
 
 
 def test_a_condition_that_holds_nothing_is_refused(capture: xr.Dataset) -> None:
-    with pytest.raises(pb.FitError, match=r"^model: it has no site exposure; hold one of .*_level"):
+    with pytest.raises(pb.FitError, match=r"^model: it has no site exposure; hold one of .*_share"):
         pb.fit(capture, scene="paper", model=HELD)
 
 
