@@ -19,7 +19,7 @@ CODE = {
     "importers": 2098,
     "inference": 2750,
     "maps": 1703,
-    "methods": 1265,
+    "methods": 1267,
     "numerics": 1006,
     "observation": 515,
     "physics": 2766,
@@ -32,7 +32,7 @@ CODE = {
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25744,
+    "code": 25746,
     "classes": 334,
     "constants": 421,
     "Any": 178,

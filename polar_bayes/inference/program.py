@@ -308,9 +308,9 @@ class Program(AbstractDensity[Observations]):
         return self.once("parameters_of_chains", jax.vmap(over_draws, in_axes=(0, None)))
 
     @functools.cached_property
-    def slopes(self) -> Callable[[Array], dict[str, Array]]:
-        """Jacobian of `constrain`, compiled."""
-        return self.once("slopes", jax.jacfwd(self.constrain))
+    def slopes(self) -> Callable[[Array, Observations], dict[str, Array]]:
+        """Jacobian of `parameters`, compiled."""
+        return self.once("slopes", jax.jacfwd(self.parameters))
 
 
 def _total(terms: Mapping[str, Array], data: Observations) -> Array:

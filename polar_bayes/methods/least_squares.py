@@ -52,7 +52,7 @@ class Point(AbstractMethod):
             stats={"loss": np.asarray(found.loss)[None, None]},
             problems=[] if found.converged else ["least squares did not meet its tolerance"],
             covariance=np.asarray(found.covariance),
-            metadata={"standard_errors": standard_errors(program, found)},
+            metadata={"standard_errors": standard_errors(program, found, problem.data)},
         )
 
 
@@ -114,12 +114,14 @@ def estimate(program: Program, data: Observations, starts: Float[Array, "start s
     return Estimate(z=z, covariance=covariance, converged=converged[best], loss=losses[best])
 
 
-def standard_errors(program: Program, estimate: Estimate) -> dict[str, list[float | None]]:
+def standard_errors(
+    program: Program, estimate: Estimate, data: Observations
+) -> dict[str, list[float | None]]:
     """Return standard errors of parameters in their physical range, by the delta method."""
     infinite = np.isinf(np.diagonal(estimate.covariance))
     covariance = np.where(np.isinf(estimate.covariance), 0.0, estimate.covariance)
     errors = {}
-    for name, slope in program.slopes(jnp.asarray(estimate.z)).items():
+    for name, slope in program.slopes(jnp.asarray(estimate.z), data).items():
         rows = np.asarray(slope).reshape(-1, program.size)
         sd = np.sqrt(np.einsum("ki,ij,kj->k", rows, covariance, rows))
         undetermined = (rows[:, infinite] != 0.0).any(axis=1)
