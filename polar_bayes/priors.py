@@ -562,7 +562,7 @@ _ROWS: dict[str, dist.Distribution] = {
     "stokes_error_factor": dist.LogNormal(math.log(1.5), 0.7),
     # Bodies under unit irradiance come near full scale at exposures of 5 to 15.
     "exposure": Metered(math.log(7.0), 3.0),
-    "exposure_share": dist.LogNormal(math.log(0.18), 1.5),
+    "exposure_share": dist.LogNormal(math.log(0.18), 2.0),
     "intensity_scale": dist.LogNormal(math.log(0.02), 1.0),
 }
 

@@ -61,7 +61,7 @@ def test_the_log_average_is_recorded_at_the_share(prior: dict[str, np.ndarray]) 
 
 
 def test_the_share_is_a_photographers(prior: dict[str, np.ndarray]) -> None:
-    expected = stats.norm(np.log(0.18), 1.5)
+    expected = stats.norm(np.log(0.18), 2.0)
     # False alarms: 1 in 10,000.
     assert stats.kstest(np.log(prior["exposure_share"]), expected.cdf).pvalue > 1e-4
 
