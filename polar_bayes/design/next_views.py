@@ -243,8 +243,9 @@ def _extended(
     recorded = np.broadcast_to(problem.data.brightness, problem.data.shape)
     recorded = recorded[..., : views.measured]
     rest = np.full((*data.shape[:-1], data.shape[-1] - views.measured), np.median(recorded))
-    brightness = jax.device_put(np.concatenate([recorded, rest], axis=-1))
-    data = dataclasses.replace(data, brightness=brightness, views=jnp.int32(views.measured))
+    brightness = np.concatenate([recorded, rest], axis=-1)
+    known = jax.device_put({"brightness": brightness, "views": np.int32(views.measured)})
+    data = dataclasses.replace(data, **known)
     compiled_model = compile_model(request, data)
     data, program, prior = compiled_model.free(data), compiled_model.program, problem.prior
     for name in (name for name in new if name not in program.observed):
@@ -280,7 +281,7 @@ def _design(
 
     def evaluate(z: Array, step: Array, data: Observations) -> tuple[dict[str, Array], Array]:
         if is_predicted:
-            data = _with_predicted_brightness(extended, z, data, views.measured)
+            data = _with_predicted_brightness(extended, z, data)
         jacobian = jax.jacfwd(lambda z: parameter_vector(program, z, data))(z)
         return information_by_view(reading_information(program, z, data, step), axes), jacobian
 
@@ -289,7 +290,7 @@ def _design(
         return of_draws, prior_precision(program, center, data)
 
     # By what its trace depends on beside the model.
-    name = f"information by {axes} of {views.measured} views, brightness {is_predicted}"
+    name = f"information by {axes}, brightness {is_predicted}"
     found = program.once(name, run)(z, center, STEP * finite_sd(extended.prior), data)
     (information, jacobian), hessian = jax.tree.map(np.asarray, found)
     size, many = program.size, data.shape[-1]
@@ -312,12 +313,12 @@ def _design(
 
 
 def _with_predicted_brightness(
-    extended: DesignProblem, z: Array, data: Observations, measured: int
+    extended: DesignProblem, z: Array, data: Observations
 ) -> Observations:
     """Give candidates the predicted brightness, which sets their noise."""
     sensor = extended.program.trace(z, data)["intensity"]["fn"]
     predicted = jnp.clip(jnp.broadcast_to(sensor.mean, data.shape), 0.0, 1.0)
-    brightness = jnp.where(jnp.arange(data.shape[-1]) < measured, data.brightness, predicted)
+    brightness = jnp.where(data.is_measured, data.brightness, predicted)
     return dataclasses.replace(data, brightness=jax.lax.stop_gradient(brightness))
 
 

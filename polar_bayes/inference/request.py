@@ -94,11 +94,11 @@ def resolve(
     precision: str,
     *,
     known: Mapping[str, float] | None = None,
-    is_perfect: bool = False,
+    of_pixel: bool = False,
 ) -> Request:
     """Check the arguments of the caller, and fill in every default.
 
-    The set-up is known to standard uncertainties, which `known` replaces, or perfectly.
+    The set-up is known to standard uncertainties, which `known` replaces; a pixel's, perfectly.
     """
     capture = validate(capture)
     if {"y", "x"} & set(map(str, capture.dims)):
@@ -114,7 +114,7 @@ def resolve(
     setup, scene_name = _find_scene(scene, capture)
     setup = as_read(setup, capture)
     acting = [each for each in setup.known if all(name in capture for name in each.needs)]
-    if not is_perfect:
+    if not of_pixel:
         setup = dataclasses.replace(setup, scene=setup.scene.known_to(acting))
     chosen = _choose_links(capture, setup, links)
     limit = setup.largest_view_zenith if largest_view_zenith is None else largest_view_zenith
@@ -123,7 +123,7 @@ def resolve(
     function = model if callable(model) else _find_model(model)
     PriorTable(priors)  # refuses what names no priors
     given = dict(priors or {})
-    usual = (_of_a_pixel() if is_perfect else {}) | default_priors(setup, capture, known)
+    usual = (_pixel_priors() if of_pixel else {}) | default_priors(setup, capture, known)
     same = {n: x for n, x in {**PRIORS, **usual}.items() if _are_same(given.get(n), x)}
     own = {name: prior for name, prior in given.items() if name not in same}
     stated = {**usual, **own, **same}
@@ -159,11 +159,11 @@ def resolve(
         seed=int(seed),
         precision=precision,
         shared=tuple(name for name in setup.shared if name in found.priors),
-        perfect=tuple(each.name for each in acting) if is_perfect else (),
+        perfect=tuple(each.name for each in acting) if of_pixel else (),
     )
 
 
-def _of_a_pixel() -> dict[str, dist.Distribution]:
+def _pixel_priors() -> dict[str, dist.Distribution]:
     """Return priors that differ in a map: an image is not exposed for the light of one pixel."""
     exposure = PRIORS["exposure"]
     return {"exposure": dist.LogNormal(exposure.loc, exposure.scale)}

@@ -216,7 +216,7 @@ def plan_map(
         raise CaptureError(what, where=str(capture.attrs.get("name", "capture")), hint=hint)
     pixel, limit = _fullest_pixel(capture), largest_view_zenith
     asked = pixel, model, scene, priors, links, limit, seed, precision
-    request = resolve(*asked, is_perfect=True)  # pixels have no input quantities of their own
+    request = resolve(*asked, of_pixel=True)  # pixels have no input quantities of their own
     known = (name for name in (*ANGLES, "normal_confidence") if name in capture)
     own = frozenset(name for name in known if set(IMAGE) & set(capture[name].dims))
     unit = _intensity_unit(capture)
