@@ -243,9 +243,8 @@ def _extended(
     recorded = np.broadcast_to(problem.data.brightness, problem.data.shape)
     recorded = recorded[..., : views.measured]
     rest = np.full((*data.shape[:-1], data.shape[-1] - views.measured), np.median(recorded))
-    brightness = np.concatenate([recorded, rest], axis=-1)
-    known = jax.device_put({"brightness": brightness, "views": np.int32(views.measured)})
-    data = dataclasses.replace(data, **known)
+    brightness, count = np.concatenate([recorded, rest], axis=-1), np.int32(views.measured)
+    data = dataclasses.replace(data, **jax.device_put({"brightness": brightness, "views": count}))
     compiled_model = compile_model(request, data)
     data, program, prior = compiled_model.free(data), compiled_model.program, problem.prior
     for name in (name for name in new if name not in program.observed):
