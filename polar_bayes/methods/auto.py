@@ -119,7 +119,7 @@ class Auto(AbstractMethod):
             return {"nuts": chains}
         # Long tails need more weighted draws than normal posteriors; beyond so many chains are the
         # better way.
-        weighted = Importance(draws=max(2048, 2 * min(8 * needed, 2**17)), rounds=1)
+        weighted = Importance(draws=max(Importance.draws, 2 * min(8 * needed, 2**17)), rounds=1)
         if max_effective_size(weighted.draws) < needed:
             return {"nuts": chains}
         return {"importance": weighted, "nuts": chains}

@@ -82,7 +82,7 @@ class Importance(AbstractMethod):
         FitError: Fewer draws or rounds.
     """
 
-    draws: int = 2048
+    draws: int = 4096
     rounds: int = 12
 
     group_size: ClassVar[int] = AbstractBatchMethod.group_size
