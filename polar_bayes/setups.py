@@ -32,7 +32,7 @@ from polar_bayes.physics.input_quantities import (
     ViewZenithScale,
 )
 from polar_bayes.physics.instrument import Analyzer, ChannelGain, Discrepancy, Instrument
-from polar_bayes.physics.part import notation
+from polar_bayes.physics.part import notation, parameters_of
 from polar_bayes.physics.scene import SCENES, Scene
 from polar_bayes.physics.stokes import LinearPolarization
 from polar_bayes.physics.surface import SmoothSurface
@@ -228,7 +228,8 @@ def _priors_known_to(
 ) -> dict[str, dist.Distribution]:
     """Return priors of input quantities that the caller or the capture states."""
     every = {**PRIORS, **own}
-    usual = {name: every[name] for name in setup.scene.parameters if name in every}
+    own_terms = parameters_of(*setup.scene.terms)
+    usual = {name: every[name] for name in own_terms if name in every}
     names = {name.removesuffix("_offset"): name for name in usual if _is_error(usual[name])}
     stated = {name: capture.attrs.get(f"{name}_uncertainty") for name in names}
     stated = {name: u for name, u in stated.items() if u is not None} | dict(known)
@@ -237,6 +238,8 @@ def _priors_known_to(
         where = f"known: {name}" if name in known else f"capture: {name}_uncertainty"
         if name not in names:
             hint = f"give some of {', '.join(names)}" if names else "a scene's terms state them"
+            if name in usual:  # no error around zero
+                hint = f"state its prior, by priors={{{name!r}: ...}}"
             raise FitError("no input quantity of this scene", where=where, hint=hint)
         check_uncertainty(u, where)
         kind = type(usual[names[name]])

@@ -14,37 +14,37 @@ CODE = {
     "calibration": 1037,
     "capture": 834,
     "cli": 1270,
-    "design": 1102,
-    "diagnostics": 1872,
-    "importers": 2098,
-    "inference": 2750,
+    "design": 1134,
+    "diagnostics": 1879,
+    "importers": 2102,
+    "inference": 2755,
     "maps": 1703,
     "methods": 1267,
     "numerics": 1006,
     "observation": 515,
     "physics": 2766,
-    "reporting": 3267,
-    "scenes": 1758,
-    "own files": 1589,
+    "reporting": 3274,
+    "scenes": 1772,
+    "own files": 1592,
     "models": 332,
-    "tests": 22969,
+    "tests": 23036,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25746,
+    "code": 25818,
     "classes": 334,
-    "constants": 421,
+    "constants": 425,
     "Any": 178,
-    "longest function": 80,
+    "longest function": 81,
 }
 """Limits of the whole package; the limit of `longest function` is in lines.
 
 The plan was 20,500 lines of code, 290 classes and 180 `Any`, for a package that had 23,938 lines.
 Since then features came that were chosen over it: readers of other people's files (900 lines),
 the set-up in the interval (210), a map to point at (290), second bounces and passages (220),
-programs on the disk (90), and exposures that are set for the light (40). The other rooms became
-smaller by a few lines only.
+programs on the disk (90), exposures that are set for the light (40), and what is known better
+beside further views (70). The other rooms became smaller by a few lines only.
 """
 
 

@@ -5,6 +5,7 @@ the posterior (Chaloner & Verdinelli 1995).
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -44,6 +45,7 @@ from polar_bayes.design.setup import (
     posterior_draws,
     provenance_attrs,
 )
+from polar_bayes.diagnostics.budget import known_to_half
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compiled_model import compile_model
 from polar_bayes.inference.problem import observe_request
@@ -56,6 +58,9 @@ from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 from polar_bayes.progress import Progress, with_progress
 from polar_bayes.scenes.scene_file import arguments_of
+
+WIDTH = 2.0 * 1.959963984540054
+"""Width of a normal distribution's 95% interval, in sds."""
 
 
 class Design(NamedTuple):
@@ -76,6 +81,16 @@ class Design(NamedTuple):
         """Return the expected covariance, (draw, option, parameter, parameter)."""
         jacobian = self.jacobian[:, None]
         return jacobian @ np.linalg.inv(information) @ np.swapaxes(jacobian, -1, -2)
+
+    def halved(self, slopes: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Return expected sds, (quantity, parameter), where each quantity alone has half its u.
+
+        The slopes are those of the quantities by the coordinates, (draw, quantity, size).
+        """
+        # Half the standard uncertainty is four times the precision.
+        scaled = math.sqrt(3.0) * slopes / u[:, None]
+        covariance = self.covariance(self.base[:, None] + scaled[..., None] * scaled[..., None, :])
+        return np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1).mean(axis=0))
 
     def conflicts(self, between_views: np.ndarray, repeatable: bool) -> np.ndarray:
         """Return which candidates exclude each other; readings of one view do not."""
@@ -111,10 +126,9 @@ def next_views(
 ) -> xr.Dataset:
     r"""Select views that would narrow the posterior most, and predict the widths.
 
-    The information of the capture, of the prior and of every candidate is known for any value of
-    the parameters; the criterion of the covariance $(P + F + \sum F_{picked})^{-1}$ is averaged
-    over draws of the posterior, so that the selection does not depend on one value. Candidates are
-    picked greedily, then exchanged until no exchange of one helps.
+    The criterion of the covariance $(P + F + \sum F_{picked})^{-1}$, of the information of prior,
+    capture and candidates, is averaged over draws of the posterior. Candidates are picked greedily,
+    then exchanged until no exchange of one helps.
 
     Args:
         capture: The views that were measured; as for `polar_bayes.fit`. Or a fit, which tells its
@@ -146,7 +160,9 @@ def next_views(
         By `pick`, the most useful first: `candidate` (its number), the four angles, and
         `wavelength` and `reading` where they were apart. By `step` (0: the capture alone; then
         after each pick): `criterion`, and by `parameter` of the material `expected_sd` (root of
-        the variance averaged over the draws) and `interval_width` of the 95% interval.
+        the variance averaged over the draws) and `interval_width` of the 95% interval. By
+        `quantity` of the set-up, if any: `uncertainty`, and by `parameter` `halved_width`, that of
+        the 95% interval of the capture alone if this quantity were known twice as well.
 
     Raises:
         CaptureError: The capture does not hold what a fit needs.
@@ -204,7 +220,12 @@ def _selected(
     rows = [i for i, one in enumerate(scalars) if one.name in MATERIAL_PARAMETERS]
     rows = rows or list(range(len(scalars)))
     names, unit = [scalars[row].label for row in rows], extended.prior_sd[rows]
-    design = design._replace(jacobian=design.jacobian[:, np.array(extended.rows)[rows]])
+    jacobian, places = design.jacobian, np.array(extended.rows)
+    design = design._replace(jacobian=jacobian[:, places[rows]])
+    known = request.standard_uncertainties(extended.program.supports)
+    known = {name: u for name, u in known.items() if name in extended.names}
+    errors = places[[extended.names.index(name) for name in known]]
+    halved = design.halved(jacobian[:, errors], np.array(list(known.values())))
 
     def loss(information: np.ndarray) -> np.ndarray:
         covariance = design.covariance(information) / np.outer(unit, unit)
@@ -224,7 +245,12 @@ def _selected(
         "limits": [float(zenith.min()), float(zenith.max()), constraints.from_light],
     }
     provenance = provenance_attrs(request, **asked, exchanges=selection.exchanges)
-    return _assemble(views, design, selection, names).assign_attrs(provenance)
+    found = _assemble(views, design, selection, names)
+    if known:
+        found["uncertainty"] = ("quantity", list(known.values()))
+        found["halved_width"] = (("quantity", "parameter"), WIDTH * halved)
+        found = found.assign_coords(quantity=list(known))
+    return found.assign_attrs(provenance)
 
 
 def _extended(
@@ -334,8 +360,7 @@ def _assemble(
             "candidate": ("pick", at),
             "criterion": ("step", selection.losses),
             "expected_sd": (("step", "parameter"), np.sqrt(variance)),
-            # A normal distribution's 95% interval.
-            "interval_width": (("step", "parameter"), 2.0 * 1.959963984540054 * np.sqrt(variance)),
+            "interval_width": (("step", "parameter"), WIDTH * np.sqrt(variance)),
         },
         coords={"parameter": names, "step": np.arange(len(picks) + 1)},
     )
@@ -376,7 +401,27 @@ def next_views_sentences(found: xr.Dataset) -> list[str]:
     ]
     if not helped.all():
         sentences.append(f"These views hardly help {', '.join(names[~helped])}.")
-    return [*sentences, *limits_sentences(found)]
+    return [*sentences, *quantity_sentences(found), *limits_sentences(found)]
+
+
+def quantity_sentences(found: xr.Dataset) -> list[str]:
+    """State which quantity of the set-up to know better, where that helps, beside the views."""
+    if "halved_width" not in found:
+        return []
+    widths = found["interval_width"].transpose("step", "parameter").to_numpy()
+    halved = found["halved_width"].transpose("quantity", "parameter").to_numpy()
+    quantities, u = found["quantity"].to_numpy(), found["uncertainty"].to_numpy()
+    best = np.argmin(halved, axis=0)
+    sentences = []
+    for at, name in enumerate(found["parameter"].to_numpy()):
+        gain, of_views = 1.0 - np.array([halved[best[at], at], widths[-1, at]]) / widths[0, at]
+        if gain >= SMALL_GAIN:
+            better = known_to_half(str(quantities[best[at]]), float(u[best[at]]))
+            sentences.append(
+                f"Without further views, the {better} narrows the 95% interval of {name} by "
+                f"{gain:.0%} (these views: {of_views:.0%})."
+            )
+    return sentences
 
 
 def limits_sentences(found: xr.Dataset) -> list[str]:

@@ -10,7 +10,8 @@ from polar_bayes.errors import FitError
 from polar_bayes.frames import PrintedFrame
 
 NOTHING = "nothing"
-"""Name of the part that an additional, unseen layer would replace."""
+"""Name of the part that an additional, unseen layer would replace, and of what replaces a part that
+may be absent."""
 
 COLUMNS = ("part", "alternative", "path", "log_bayes_factor", "mean", "other", "shift", "redefined")
 
@@ -24,12 +25,13 @@ def alternatives(result: xr.DataTree | FitView) -> pd.DataFrame:
     Returns:
         A row for each alternative and material parameter (every parameter of a model that declares
         none of the material's): part and alternative (class names; "nothing" and a layer such as
-        "water film" where the alternative adds one), path (of the part in the scene),
-        log_bayes_factor (of the alternative over the scene of the fit, natural logarithm), mean
-        (posterior mean, unit of the parameter), other (value by the alternative: the mean moved by
-        the difference of both modes), shift (that difference in posterior sds), and redefined (True
-        where the parameter means something else with the alternative). The index holds the names of
-        the parameters. Empty where the scene has no part with an alternative.
+        "water film" where the alternative adds one, a body and "nothing" where it leaves the body
+        out), path (of the part in the scene), log_bayes_factor (of the alternative over the scene
+        of the fit, natural logarithm), mean (posterior mean, unit of the parameter), other (value
+        by the alternative: the mean moved by the difference of both modes), shift (that difference
+        in posterior sds), and redefined (True where the parameter means something else with the
+        alternative). The index holds the names of the parameters. Empty where the scene has no part
+        with an alternative.
 
     Raises:
         FitError: The tree holds no posterior, or its alternatives were not compared.

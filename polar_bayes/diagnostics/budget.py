@@ -15,7 +15,6 @@ Source: JCGM 100:2008 (GUM), 5.1; Rodgers (2000), Inverse Methods for Atmospheri
 Kallioinen et al. (2024), Statistics and Computing 34, 57 (power scaling).
 """
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -36,6 +35,9 @@ from polar_bayes.setups import check_uncertainty
 WEIGHTS, DISCREPANCY = "discrepancy_weights", "model discrepancy"
 """Parameters of a smooth error over angle, and their row in the table."""
 
+HALVED = " halved"
+"""End of the names of columns with the sd for half of the standard uncertainty of a quantity."""
+
 
 def budget(
     result: xr.DataTree | FitView, *, known: Mapping[str, float] | None = None
@@ -52,8 +54,9 @@ def budget(
         A row for each scalar parameter of the material, in its unit: the posterior's standard
         deviation `sd`; `perfect`, what it would be in a set-up known perfectly; and what
         contributes to `sd`, in squares: the `noise`, the `prior`, the `model discrepancy` where the
-        scene has one, and each input quantity, which has a sign. The attribute `known` has the
-        standard uncertainties of the quantities.
+        scene has one, and each input quantity, which has a sign. Columns such as `light_zenith
+        halved` have what `sd` would be if that quantity alone were known twice as well. The
+        attribute `known` has the standard uncertainties of the quantities.
 
     Raises:
         FitError: The result is no fit, its scene has no input quantity, or none of that name.
@@ -80,7 +83,8 @@ def budget(
                 noise = _share_of_noise(scalar, densities)
                 rows[scalar.label] = _row(joint, noise, stated, asked)
     smooth = [DISCREPANCY] if weights else []
-    columns = ["sd", "perfect", "noise", "prior", *smooth, *stated.index]
+    halved = [f"{name}{HALVED}" for name in stated.index]
+    columns = ["sd", "perfect", "noise", "prior", *smooth, *stated.index, *halved]
     table = PrintedFrame.from_dict(rows, orient="index", columns=columns)
     table.attrs["known"] = asked.to_dict()
     return table
@@ -111,10 +115,10 @@ def _covariance(scalar: Scalar, errors: Mapping[str, Scalar]) -> Float[np.ndarra
 def _row(
     joint: Float[np.ndarray, "n n"], noise: float, stated: pd.Series, asked: pd.Series
 ) -> list[float]:
-    """Return the sd of one parameter, its sd for a perfect set-up, and all contributions."""
+    """Return one parameter's sd, that for a perfect set-up, all contributions, and other sds."""
     count, weights = len(stated), np.ones(len(joint) - 1 - len(stated))  # weights are last
     if not np.isfinite(joint).all():
-        return [np.nan] * (4 + bool(weights.size) + count)
+        return [np.nan] * (4 + bool(weights.size) + 2 * count)
     known, now = (pd.Series([*each, *weights]) for each in (stated, asked))
     variance, with_errors = _known_otherwise(joint, known, now)
     own = joint[1 : count + 1, 1 : count + 1], joint[0, 1 : count + 1]
@@ -123,7 +127,13 @@ def _row(
     rest = variance - np.sum(parts**2)
     variances = [variance, perfect, noise * rest, (1.0 - noise) * rest]
     variances += [np.sum(parts[count:] ** 2)] if weights.size else []
-    return [*np.sqrt(np.maximum(variances, 0.0)), *parts[:count]]
+    halves = [now.where(now.index != at, 0.5 * now) for at in range(count)]
+    halved = [_known_otherwise(joint, known, half)[0] for half in halves]
+    return [
+        *np.sqrt(np.maximum(variances, 0.0)),
+        *parts[:count],
+        *np.sqrt(np.maximum(halved, 0.0)),
+    ]
 
 
 def _known_otherwise(
@@ -137,9 +147,10 @@ def _known_otherwise(
 
 
 def variance_shares(table: pd.DataFrame) -> pd.DataFrame:
-    """Convert a budget from standard uncertainties to shares of the variance."""
-    parts = table.drop(columns=["sd", "perfect"]) ** 2
-    return table[["sd", "perfect"]].join(parts.div(parts.sum(axis=1), axis=0))
+    """Convert the contributions of a budget from standard uncertainties to shares of variance."""
+    sds = [name for name in table if name in ("sd", "perfect") or name.endswith(HALVED)]
+    parts = table.drop(columns=sds) ** 2
+    return table[sds].join(parts.div(parts.sum(axis=1), axis=0))
 
 
 def _asked(stated: pd.Series, known: Mapping[str, float]) -> pd.Series:
@@ -167,22 +178,25 @@ def _share_of_noise(scalar: Scalar, densities: list[np.ndarray | None]) -> float
 
 def better_known(fit: FitView, label: str) -> tuple[str, float]:
     """What narrows a parameter most if it is known twice as well, in words; its sd by then."""
-    errors, stated = _errors(fit), _stated(fit)
-    joint = _covariance(next(each for each in fit.scalars if each.label == label), errors)
-    half = 0.5 * stated
-    variances = {
-        name: _known_otherwise(joint, stated, stated.where(stated.index != name, half))[0]
-        for name in errors
-    }
-    name = min(variances, key=variances.__getitem__)
-    meaning, known = described(fit, name, stated[name])
-    _, better = described(fit, name, half[name])
-    return f"{meaning} known to {better} instead of {known}", math.sqrt(variances[name])
+    stated, row = _stated(fit), budget(fit).loc[label]
+    halved = row[[f"{name}{HALVED}" for name in stated.index]].set_axis(stated.index)
+    name = str(halved.idxmin())
+    return known_to_half(_errors(fit)[name].name, stated[name]), float(halved[name])
+
+
+def known_to_half(parameter: str, u: float) -> str:
+    """State that the quantity of a parameter of the instrument is known twice as well."""
+    (meaning, known), (_, better) = _sized(parameter, u), _sized(parameter, 0.5 * u)
+    return f"{meaning} known to {better} instead of {known}"
 
 
 def described(fit: FitView, quantity: str, u: float) -> tuple[str, str]:
     """Describe an input quantity, and its standard uncertainty with its unit."""
-    _, meaning, unit = notation(_errors(fit)[quantity].name)
+    return _sized(_errors(fit)[quantity].name, u)
+
+
+def _sized(parameter: str, u: float) -> tuple[str, str]:
+    _, meaning, unit = notation(parameter)
     return meaning, f"{u:.2g}{'' if unit == '1' else f' {unit}'}"
 
 

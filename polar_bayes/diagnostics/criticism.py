@@ -448,11 +448,12 @@ def _alternatives(fit: FitView, absent: Sequence[Scalar]) -> Finding:
         large = highest > math.log(1e4)
         times = f"10^{highest / math.log(10.0):.0f}" if large else f"{math.exp(highest):.3g}"
         sentence = (
-            f"Another part explains the readings better: {_swap_text(alternative, part)} ({path}), "
-            f"by a Bayes factor of {times}; fit the scene that has it."
+            f"Another scene explains the readings better: {_swap_text(alternative, part)} "
+            f"({path}), by a Bayes factor of {times}; fit that scene."
         )
-        # What a smooth error has stood in for without harm to the answer only widens it.
-        stands_in = part == NOTHING and not moves.any()
+        # What a smooth error has stood in for without harm to the answer only widens it, as does a
+        # body that may be absent.
+        stands_in = (part == NOTHING and not moves.any()) or alternative == NOTHING
         return judged_by(p_value, highest, sentence, most="caution" if stands_in else "problem")
     layer, factor = table["part"] == NOTHING, table["log_bayes_factor"]
     moving, favored = table["moves"] & (factor > LIMITS.refuted), factor > LIMITS.favored

@@ -228,8 +228,7 @@ def signal_of(frames: Sequence[np.ndarray], level: float | None, detector: Detec
         saturated=raw >= full,
         full_scale=float(np.max((full - dark) / flat)),
         metadata={
-            "transfer": transfer.description,
-            "transfer_gamma": transfer.gamma,
+            **transfer.metadata,
             "saturation_level": full,
             "dark": _source(detector.dark),
             "flat": _source(detector.flat),

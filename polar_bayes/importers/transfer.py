@@ -28,6 +28,11 @@ from PIL import Image
 from polar_bayes.capture.schema import Interval
 from polar_bayes.errors import CaptureError
 
+UNDONE_UNCERTAINTY = 0.05
+"""Relative standard uncertainty of the gamma of frames whose curve is undone by its name. The
+curves of cameras differ from the standard of their files (Grossberg & Nayar 2004, IEEE TPAMI 26,
+1272): gammas of 1.96 (BT.709) to 2.2 are called the same."""
+
 
 class Transfer(NamedTuple):
     """The correction of one tone curve.
@@ -41,6 +46,12 @@ class Transfer(NamedTuple):
     description: str
     gamma: float
     linear: Callable[[np.ndarray, float], np.ndarray]
+
+    @property
+    def metadata(self) -> dict[str, str | float]:
+        """Attributes of a capture; the uncertainty of a sensor without a curve is the set-up's."""
+        known = {"tone_curve_uncertainty": UNDONE_UNCERTAINTY} if self.gamma != 1.0 else {}
+        return {"transfer": self.description, "transfer_gamma": self.gamma, **known}
 
 
 def _srgb(counts: np.ndarray, white: float) -> np.ndarray:

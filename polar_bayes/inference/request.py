@@ -2,10 +2,12 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Container, Mapping
 from numbers import Integral
 
 import jax
+import numpy as np
 import xarray as xr
 from numpyro import distributions as dist
 from numpyro.primitives import Messenger
@@ -21,6 +23,8 @@ from polar_bayes.models.per_material import per_material
 from polar_bayes.numerics.compile import TRACING_LOCK, LRUCache
 from polar_bayes.observation.data import observe
 from polar_bayes.observation.links import AbstractLink
+from polar_bayes.physics.instrument import Discrepancy
+from polar_bayes.physics.part import parameters_of
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.surface import SmoothSurface
 from polar_bayes.priors import (
@@ -69,6 +73,13 @@ class Request(ModelParts):
     """Parameters of the set-up that the pixels of an image share by default."""
     perfect: tuple[str, ...]
     """Input quantities of the set-up that count as known perfectly."""
+
+    def standard_uncertainties(self, sampled: Container[str]) -> dict[str, float]:
+        """Return standard deviations of the priors of scalar parameters of the instrument."""
+        terms = (each for each in self.scene.terms if not isinstance(each, Discrepancy))
+        priors = {name: self.priors[name] for name in parameters_of(*terms) if name in sampled}
+        variances = {name: float(np.sum(prior.variance)) for name, prior in priors.items()}
+        return {name: math.sqrt(x) for name, x in variances.items() if 0.0 < x < math.inf}
 
     def describe(self) -> Provenance:
         """Describe the request in types of JSON, for the provenance of a result."""

@@ -77,11 +77,12 @@ class Part(HTMLRepr, abc.ABC):
         """
         return ()
 
-    def alternatives(self) -> "tuple[Part, ...]":
+    def alternatives(self) -> "tuple[Part | None, ...]":
         """Return parts that could replace this one, and that readings may not distinguish.
 
         Returns:
-            Parts that every fit compares with this one, each alone; empty where there are none.
+            Parts that every fit compares with this one, each alone, and None where the part may be
+            absent, which a fit compares if the part may send nothing; empty where there are none.
         """
         return ()
 

@@ -100,8 +100,8 @@ class Lambertian(DiffuseBody):
         return (Unpolarized(self.albedo, self.internal_reflection),)
 
     @override
-    def alternatives(self) -> tuple[Part, ...]:
-        return (Depolarizer(),)
+    def alternatives(self) -> tuple[Part | None, ...]:
+        return Depolarizer(), None
 
     @override
     def light(self, parameters: Parameters, geometry: Geometry, interface: Interface) -> Light:

@@ -16,6 +16,7 @@ from polar_bayes.diagnostics.alternatives import alternatives
 from polar_bayes.diagnostics.approximation import smoothed_weights
 from polar_bayes.diagnostics.budget import (
     DISCREPANCY,
+    HALVED,
     budget,
     budget_sentences,
     described,
@@ -168,7 +169,7 @@ def fit_card(result: xr.DataTree | FitView) -> page.Card:
         *(f"Caution: {caution}" for caution in judged.cautions),
         text.swapped_sentence(fit.provenance),
     ]
-    return sentences, parameter_table(fit), judged.passed
+    return sentences, parameter_table(fit, with_setup=True), judged.passed
 
 
 def plot_fit(result: xr.DataTree | FitView) -> Figure:
@@ -182,8 +183,11 @@ def plot_fit(result: xr.DataTree | FitView) -> Figure:
 # --- Parameters -----------------------------------------------------------------------------------
 
 
-def parameter_table(fit: FitView) -> Table:
-    """Return a table of parameters: interval, known truth, and what determines each."""
+def parameter_table(fit: FitView, *, with_setup: bool = False) -> Table:
+    """Return a table of parameters: interval, known truth, and what determines each.
+
+    The set-up's column is the share of the variance that a set-up known perfectly would take away.
+    """
     if fit.method == "point":
         return _estimate_table(fit)
     cells: page.Cells = {
@@ -196,6 +200,10 @@ def parameter_table(fit: FitView) -> Table:
         "by the data": lambda row: str(row["verdict"]),
     }
     data = convergence.summary(fit).join(sensitivity(fit)[["prior_inside", "verdict"]])
+    if with_setup and has_budget(fit):
+        table = budget(fit)
+        data["of_setup"] = 1.0 - (table["perfect"] / table["sd"]) ** 2
+        cells = {**cells, "of the set-up": share("of_setup")}
     limits = {"determined": LIMITS.determined, "partly": LIMITS.partly}
     return fit_table(fit, "fit.parameter", cells, data, **limits)
 
@@ -435,10 +443,19 @@ def budget_table(fit: FitView) -> Table:
     for quantity, u in found.attrs["known"].items():
         descriptions[quantity] = ", ± ".join(described(fit, quantity, u))
 
+    is_halved = data.index.str.endswith(HALVED)
+    data, halved = data[~is_halved], data[is_halved]
+
     def cell(label: str) -> Callable[[pd.Series], str]:
+        def sd(row: pd.Series) -> str:
+            return number(row[label], row[label])
+
         def of_row(row: pd.Series) -> str:
-            is_share = row.name not in ("sd", "perfect")
-            return percent(row[label]) if is_share else number(row[label], row[label])
+            if row.name in ("sd", "perfect"):
+                return sd(row)
+            better = f"{row.name}{HALVED}"
+            told = f" → {sd(halved.loc[better])}" if better in halved.index else ""
+            return f"{percent(row[label])}{told}"
 
         return of_row
 

@@ -16,9 +16,8 @@ import xarray as xr
 from polar_bayes.benchmark.advice import Study, accuracy_view
 from polar_bayes.calibration.scores import is_calibrated, p_values, significance_level
 from polar_bayes.calibration.verdict import CalibrationView, calibration_verdict
-from polar_bayes.design.next_views import SMALL_GAIN, limits_sentences
+from polar_bayes.design.next_views import SMALL_GAIN, limits_sentences, quantity_sentences
 from polar_bayes.diagnostics import convergence
-from polar_bayes.diagnostics.budget import better_known, budget, wider_by_setup
 from polar_bayes.diagnostics.compare import FitComparison
 from polar_bayes.diagnostics.convergence import Verdict
 from polar_bayes.diagnostics.criticism import criticize
@@ -378,18 +377,14 @@ def _expected_widths(views: xr.Dataset) -> tuple[str, np.ndarray, np.ndarray]:
 
 
 def next_sentences(fit: FitView) -> list[str]:
-    """State what to measure next and what to know better: first what narrows n more."""
+    """State what to measure next, and what of the set-up to know better."""
     sentences = [_views_sentence(fit.result)]
-    wider = wider_by_setup(fit).filter(like="refractive_index")
-    if "next_views" not in fit.result.children or wider.empty:
+    if "next_views" not in fit.result.children:
         return sentences
-    label = str(wider.index[0])
-    (what, sd), now = better_known(fit, label), budget(fit).loc[label, "sd"]
-    share, (_, before, after) = 1.0 - sd / now, _expected_widths(fit.result["next_views"].dataset)
-    known = f"the {what} narrows the 95% interval of {label} by {share:.0%}."
-    helps_more = share > np.max(1.0 - after / before)
-    sentences.insert(0 if helps_more else 1, f"Without further views, {known}")
-    return sentences
+    found = fit.result["next_views"].to_dataset()
+    of_index = [str(x) for x in found["parameter"].to_numpy() if x.startswith("refractive_index")]
+    told = quantity_sentences(found.sel(parameter=of_index) if of_index else found)
+    return [*sentences, *told]
 
 
 def trust(fit: FitView) -> str:

@@ -57,6 +57,7 @@ from polar_bayes.scenes.library import (
 )
 from polar_bayes.scenes.neighbors import suits_index
 from polar_bayes.scenes.sentences import SceneComparison, is_apart
+from polar_bayes.setups import SETUPS, UNSTATED, Setup
 
 MAX_FITS = 12
 """Largest number of candidates that forward selection fits."""
@@ -167,7 +168,7 @@ def compare_candidates(arguments: "FitArguments", progress: Progress) -> SceneCo
     simplest = library.scene(library.simplest)
     fringes = "wavelength" in arguments.capture.coords
     layered = [each.apply(simplest) for each in unseen_layers(simplest, has_wavelength=fringes)]
-    arguments = arguments.among([*library.single_parts(), *layered])
+    arguments = arguments.among([*library.single_parts(), *layered]).measured
     lifted = lifted_prior(arguments, simplest)
     fits = _Fits(arguments.with_priors(lifted), progress)
     with jax.enable_x64(arguments.precision == "double"):
@@ -205,6 +206,7 @@ class FitArguments:
     seed: int
     precision: str
     known: Mapping[str, float] | None = None
+    setup: Setup | None = None
     scene_parameters: frozenset[str] = frozenset()
     """Parameters that any of the scenes reads."""
     seconds: float | None = None
@@ -240,6 +242,12 @@ class FitArguments:
         names = frozenset(name for scene in scenes for name in scene.parameters)
         return dataclasses.replace(self, scene_parameters=names)
 
+    @property
+    def measured(self) -> "FitArguments":
+        """The arguments with an instrument that nobody called perfect."""
+        is_named = "setup" in self.capture.attrs
+        return self if is_named else dataclasses.replace(self, setup=SETUPS[UNSTATED])
+
     def with_priors(self, priors: Mapping[str, dist.Distribution]) -> "FitArguments":
         """Return the arguments with these priors added or replaced."""
         return dataclasses.replace(self, priors={**(self.priors or {}), **priors} or None)
@@ -248,7 +256,8 @@ class FitArguments:
         """Return the request of one scene, without priors that only other scenes read."""
         others = self.scene_parameters - set(scene.parameters)
         own = {name: prior for name, prior in (self.priors or {}).items() if name not in others}
-        asked = self.capture, self.model, scene, own or None, self.chosen_links
+        setup = dataclasses.replace(self.setup, scene=scene) if self.setup else scene
+        asked = self.capture, self.model, setup, own or None, self.chosen_links
         limits = self.largest_view_zenith, self.seed, self.precision
         return resolve(*asked, *limits, known=self.known)
 

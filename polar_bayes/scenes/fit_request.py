@@ -28,8 +28,6 @@ from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import Provenance, assemble
 from polar_bayes.methods.method import AbstractMethod, find_method
 from polar_bayes.numerics.compile import check_memory, compiled
-from polar_bayes.physics.instrument import Discrepancy
-from polar_bayes.physics.part import parameters_of
 from polar_bayes.priors import support_bounds
 from polar_bayes.progress import Progress
 from polar_bayes.scenes.neighbors import STOPPED, fit_comparisons, removed_terms, try_alternatives
@@ -181,15 +179,6 @@ def _prior_probability(request: Request, posterior: Values) -> dict[str, list[fl
     return found
 
 
-def _known(request: Request, problem: Problem) -> dict[str, float]:
-    """Return standard deviations of the priors of scalar parameters of the instrument."""
-    terms = (each for each in request.scene.terms if not isinstance(each, Discrepancy))
-    names = parameters_of(*terms)
-    priors = {name: request.priors[name] for name in names if name in problem.program.supports}
-    variances = {name: float(np.sum(prior.variance)) for name, prior in priors.items()}
-    return {name: math.sqrt(x) for name, x in variances.items() if 0.0 < x < math.inf}
-
-
 def _indices_by_eye(request: Request) -> dict[str, list[float]]:
     """Return the index by eye of each material; empty where coats or light move the peak."""
     source = getattr(request.scene.surface, "illumination", None)
@@ -217,7 +206,7 @@ def _provenance(request: Request, method: AbstractMethod, problem: Problem) -> P
         "model_source": _model_source(request.model),
         "capture_cautions": list(cautions(request.capture)),
         "indices_by_eye": _indices_by_eye(request),
-        "known": _known(request, problem),
+        "known": request.standard_uncertainties(problem.program.supports),
         "bounds": {name: _finite_bounds(prior) for name, prior in request.priors.items()},
         "declared": request.declared,
         "fixed": request.fixed,

@@ -46,9 +46,10 @@ from polar_bayes.numerics.optimize import (
     symmetrize,
 )
 from polar_bayes.physics.instrument import AbstractInstrumentTerm, Discrepancy
+from polar_bayes.physics.part import ABSENT
 from polar_bayes.physics.scene import Scene
 from polar_bayes.physics.surface import SmoothSurface
-from polar_bayes.physics.variants import alternatives_of
+from polar_bayes.physics.variants import Effect, alternatives_of
 from polar_bayes.priors import INDICES, resolve_priors
 from polar_bayes.progress import Progress
 
@@ -63,6 +64,10 @@ Bodies of index 1.33 to 1.8 give these values under water. Few solids have an in
 above 1.65, but films produce such values."""
 SLACK = 1.5
 """Distance beyond these ranges, in posterior sds, at which a layer is still compared."""
+
+NEAR = 3.0
+"""Distance from the value at which a part sends nothing, in posterior sds, up to which the scene
+without that part is compared."""
 
 STOPPED = "it was stopped before it was done"
 """Reason for a missing comparison that the user interrupted."""
@@ -186,6 +191,30 @@ def suits_index(layer: str, index: ArrayLike | None) -> bool:
     return bool(np.any(within))
 
 
+def suits_absence(field: str, posterior: Values) -> bool:
+    """Return whether draws allow that the part of a field of the scene sends nothing."""
+    for name, absent in ABSENT.items():
+        if absent.part == field and name in posterior:
+            distance = np.abs(np.asarray(posterior[name]) - absent.value)
+            if np.any(distance.mean(axis=(0, 1)) < NEAR * distance.std(axis=(0, 1))):
+                return True
+    return False
+
+
+def _called_for(request: Request, posterior: Values) -> list[Effect]:
+    """Return the alternatives that the posterior does not exclude."""
+    # A thin film on facets takes as long to search as the fit itself; `compare_scenes` tries it.
+    is_smooth = isinstance(request.scene.surface, SmoothSurface)
+    fringes = is_smooth and "wavelength" in request.capture.coords
+    index = posterior.get("refractive_index")
+    return [
+        each
+        for each in alternatives_of(request.scene, has_wavelength=fringes)
+        if (each.part is not None or suits_index(each.name, index))
+        and (each.replacement is not None or suits_absence(str(each.key_path[0]), posterior))
+    ]
+
+
 def compare_alternatives(
     request: Request,
     problem: Problem,
@@ -200,15 +229,7 @@ def compare_alternatives(
     already are left out. A `FitError` where all coordinates together have no modes, as those of
     many patches.
     """
-    # A thin film on facets takes as long to search as the fit itself; `compare_scenes` tries it.
-    is_smooth = isinstance(request.scene.surface, SmoothSurface)
-    fringes = is_smooth and "wavelength" in request.capture.coords
-    offered = alternatives_of(request.scene, has_wavelength=fringes)
-    index = posterior.get("refractive_index")
-    called_for = [
-        each for each in offered if each.part is not None or suits_index(each.name, index)
-    ]
-    scenes = {each: each.apply(request.scene) for each in called_for}
+    scenes = {each: each.apply(request.scene) for each in _called_for(request, posterior)}
     alternatives = [each for each, scene in scenes.items() if scene not in compared]
     if not alternatives:
         return []
@@ -228,9 +249,7 @@ def compare_alternatives(
         progress("comparing alternatives", number / len(alternatives))
         row: Provenance = {
             "part": NOTHING if alternative.part is None else type(alternative.part).__name__,
-            "alternative": alternative.name
-            if alternative.part is None
-            else type(alternative.replacement).__name__,
+            "alternative": _name_of(alternative),
             "path": alternative.path,
             "defines": [] if alternative.part is None else list(alternative.part.defines),
         }
@@ -255,6 +274,14 @@ def compare_alternatives(
         rows.append(row | {"log_bayes_factor": factor, "shift": shift})
     progress("comparing alternatives", 1.0)
     return rows
+
+
+def _name_of(alternative: Effect) -> str:
+    """Return the class of what takes a place, or the name of a layer."""
+    if alternative.replacement is None:
+        return NOTHING
+    is_layer = alternative.part is None
+    return alternative.name if is_layer else type(alternative.replacement).__name__
 
 
 def _with_scene(

@@ -9,11 +9,12 @@ import xarray as xr
 from cases import each
 from design_lines import ASKED, NOISE, PRIOR, angles, line, line_capture, precision_of, rows_of
 from numpyro import distributions as dist
-from plates import KNOWN, ON_PLATE, plate_capture
+from plates import KNOWN, ON_PLATE, PLATE, plate_capture
 from synthetic_results import make_result
 
 import polar_bayes as pb
 from polar_bayes.design.optimal_design import fedorov_exchange
+from polar_bayes.physics.input_quantities import SampleLean, ToneCurve
 from polar_bayes.simulation import Protocol
 
 START = np.array([40.0, 50.0])
@@ -243,6 +244,22 @@ def test_views_that_are_not_taken_change_nothing() -> None:
         for zeniths in ([44.0, 45.0, 46.0], [1.0, 2.0, 80.0])
     ]
     np.testing.assert_allclose(*sd, rtol=1e-9)
+
+
+def test_a_quantity_known_twice_as_well_does_what_its_prior_does(plate: xr.Dataset) -> None:
+    """The same draws with half of the standard uncertainty from the start."""
+    links = {"q": pb.links.StokesLink(stated_errors=True)}
+    setup = pb.setups.Setup(PLATE, links, known=(SampleLean(), ToneCurve()))
+    asked = {"scene": setup, "count": 1, "draws": 4}
+    fit = pb.fit(plate, scene=setup, method="laplace")
+    found = pb.next_views(plate, result=fit, **asked)
+    assert found["quantity"].to_numpy().tolist() == ["sample_lean_offset", "tone_curve_offset"]
+    np.testing.assert_allclose(found["uncertainty"], [0.2, 0.01], rtol=1e-6)  # single precision
+    for name, u in zip(found["quantity"].to_numpy(), found["uncertainty"].to_numpy(), strict=True):
+        better = pb.next_views(plate, result=fit, priors={name: dist.Normal(0.0, 0.5 * u)}, **asked)
+        np.testing.assert_allclose(
+            found["halved_width"].sel(quantity=name), better["interval_width"][0], rtol=1e-6
+        )
 
 
 @pytest.mark.thorough

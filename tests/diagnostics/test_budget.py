@@ -101,11 +101,17 @@ def test_what_is_known_better_or_worse_does_what_another_fit_says(fit, capture, 
 def test_contributions_add_in_squares(fit: xr.DataTree) -> None:
     table = pb.budget(fit)
     np.testing.assert_allclose(table["sd"], sds(fit), rtol=1e-3)  # of n - 1, and of n
-    parts = table.drop(columns=["sd", "perfect"])
+    parts = table[["noise", "prior", *KNOWN]]
     np.testing.assert_allclose((parts**2).sum(axis=1), table["sd"] ** 2)
-    shares = variance_shares(table).drop(columns=["sd", "perfect"])
+    shares = variance_shares(table)[list(parts)]
     np.testing.assert_allclose(shares.sum(axis=1), 1.0)
     assert table.attrs["known"] == KNOWN
+
+
+@each("name", list(KNOWN))
+def test_what_is_known_twice_as_well_has_a_column(fit: xr.DataTree, name: str) -> None:
+    told = pb.budget(fit, known={name: 0.5 * KNOWN[name]})["sd"]
+    np.testing.assert_allclose(pb.budget(fit)[f"{name} halved"], told)
 
 
 def test_each_factor_of_a_normal_posterior_contributes_its_precision() -> None:
@@ -119,7 +125,9 @@ def test_each_factor_of_a_normal_posterior_contributes_its_precision() -> None:
     found = _row(joint, by_noise / (by_noise + parts[0]), stated, stated)
     rest = [0, 3, 4, 5]
     perfect = np.linalg.inv((noise + own)[np.ix_(rest, rest)])[0, 0]
-    expected = [joint[0, 0], perfect, by_noise, parts[0], parts[3:].sum(), *parts[1:3]]
+    halves = [np.diag(3.0 * np.diag(own) * (np.arange(6) == at)) for at in (1, 2)]
+    halved = [np.linalg.inv(noise + own + more)[0, 0] for more in halves]
+    expected = [joint[0, 0], perfect, by_noise, parts[0], parts[3:].sum(), *parts[1:3], *halved]
     np.testing.assert_allclose(np.square(found), expected, rtol=1e-6)
 
 
@@ -130,7 +138,8 @@ def test_a_discrepancy_has_a_column_of_its_own() -> None:
     posterior["roughness"] = 0.2 + 0.03 * weight + 1e-4 * posterior["roughness"]
     result["posterior"] = posterior.assign(angle_zero=posterior["absorption"])
     table = pb.budget(edit_provenance(result, known={"angle_zero": 0.75}))
-    assert list(table)[2:] == ["noise", "prior", "model discrepancy", "angle_zero"]
+    quantities = ["angle_zero", "angle_zero halved"]
+    assert list(table)[2:] == ["noise", "prior", "model discrepancy", *quantities]
     assert table.loc["roughness", "model discrepancy"] == pytest.approx(0.03, rel=0.2)
 
 
@@ -169,26 +178,27 @@ def test_what_only_adds_is_known_to_its_standard_deviation(capture: xr.Dataset) 
     assert type(prior) is type(pb.PRIORS["ambient_light_offset"])
 
 
-@each(("width", "place"), [(0.99, 0), (0.01, 1)], ids=["views help less", "views help more"])
-def test_what_to_know_better_stands_beside_further_views(fit, width, place) -> None:
+def test_what_to_know_better_stands_beside_further_views(fit: xr.DataTree) -> None:
     told = fit.copy()
     told["next_views"] = xr.Dataset(
         {
-            "interval_width": (("step", "parameter"), [[1.0], [width]]),
+            "interval_width": (("step", "parameter"), [[1.0, 1.0], [0.96, 0.5]]),
+            "halved_width": (("quantity", "parameter"), [[0.6, 0.9], [0.5, 0.95]]),
+            "uncertainty": ("quantity", [0.2, 0.02]),
             **{name: ("pick", [70.0]) for name in ("view_zenith", "light_zenith")},
             **{name: ("pick", [180.0]) for name in ("view_azimuth", "light_azimuth")},
         },
-        coords={"parameter": ["refractive_index"]},
+        coords={
+            "parameter": ["refractive_index", "subsurface_fraction"],
+            "quantity": ["sample_lean_offset", "tone_curve_offset"],
+        },
     )
-    now, half = pb.budget(fit), pb.budget(fit, known={"tone_curve": 0.01})
-    share = 1.0 - half.loc["refractive_index", "sd"] / now.loc["refractive_index", "sd"]
-    assert 0.01 < share < 0.99
-    sentences = next_sentences(view_of(told))
-    assert sentences[place] == (
+    views, better = next_sentences(view_of(told))
+    assert views.startswith("Measure next at zenith 70, azimuth 180: ")
+    assert better == (
         "Without further views, the exponent of the sensor's tone curve known to 0.01 instead of "
-        f"0.02 narrows the 95% interval of refractive_index by {share:.0%}."
+        "0.02 narrows the 95% interval of refractive_index by 50% (these views: 4%)."
     )
-    assert sentences[1 - place].startswith("Measure next at zenith 70, azimuth 180: ")
     assert len(next_sentences(view_of(fit))) == 1
 
 
@@ -213,6 +223,20 @@ def test_what_cannot_be_known_is_refused(fit, capture, known: dict, message: str
         pb.FitError, match="capture: sample_lean_uncertainty: it is 'by eye'; give a"
     ):
         pb.fit(capture.assign_attrs(sample_lean_uncertainty="by eye"), **ASKED)
+
+
+@each(
+    "name, hint",
+    [
+        ("roughness", "give some of light_zenith, "),
+        ("dolp_gain", "state its prior, by priors={'dolp_gain': ...}"),
+    ],
+)
+def test_what_is_no_error_of_the_set_up_keeps_its_prior(name: str, hint: str) -> None:
+    capture = pb.simulate("plastic", scene="camera", seed=0)
+    message = f"known: {name}: no input quantity of this scene; {hint}"
+    with pytest.raises(pb.FitError, match=f"^{re.escape(message)}"):
+        pb.fit(capture, known={name: 0.02})
 
 
 def test_a_set_up_that_states_nothing_has_no_budget(capture) -> None:

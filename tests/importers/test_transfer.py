@@ -126,6 +126,7 @@ def test_an_srgb_capture_of_8_bits_is_the_linear_one_to_quantization(full: float
     assert both.sum() > 400
     assert found.attrs["masked_saturated"] > 0
     assert found.attrs["transfer"] == "sRGB (IEC 61966-2-1), undone"
+    assert found.attrs["tone_curve_uncertainty"] == 0.05
     assert found.attrs["saturation_level"] == pytest.approx(limit)
     # A count is 2.3 linear counts wide at white, so four angles add up to 2.3 at most.
     np.testing.assert_allclose(

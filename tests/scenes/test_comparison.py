@@ -66,6 +66,18 @@ def test_a_prior_is_used_by_the_scenes_that_read_it(capture: xr.Dataset) -> None
         dataclasses.replace(among, priors={"roughness": dist.HalfNormal(0.1)}).request(PLATE)
 
 
+def test_scenes_of_a_capture_that_names_no_set_up_have_no_perfect_instrument(
+    capture: xr.Dataset,
+) -> None:
+    def quantities(capture: xr.Dataset) -> set[str]:
+        arguments = FitArguments(capture, "per_material", None, LINKS, None, 0, "double")
+        return {type(term).__name__ for term in arguments.measured.request(PLATE).scene.terms}
+
+    assert "setup" not in capture.attrs
+    assert {"IncidenceAngle", "PolarizationLoss"} <= quantities(capture)
+    assert quantities(capture.assign_attrs(setup="paper")) == set()
+
+
 def test_a_stacked_posterior_is_a_fit_with_draws_of_every_scene(
     comparison: SceneComparison, tmp_path: Path
 ) -> None:

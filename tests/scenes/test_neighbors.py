@@ -88,9 +88,16 @@ def test_a_scene_without_alternatives_has_an_empty_table_and_a_point_fit_none() 
 
 
 def _fit(
-    preset: str, setup: str, seed: int = 0, parameters=None, noise=None, **parts
+    preset: str,
+    setup: str,
+    seed=0,
+    parameters=None,
+    noise=None,
+    views=40,
+    largest_view_zenith=85.0,
+    **parts,
 ) -> xr.DataTree:
-    """Fit a set-up to forty readings simulated with other parts or known parameters."""
+    """Fit a set-up to readings simulated with other parts or known parameters."""
     own = pb.setups.SETUPS[setup]
     if "distribution" in parts:
         parts = {"surface": dataclasses.replace(own.scene.surface, **parts)}
@@ -98,7 +105,7 @@ def _fit(
         preset,
         scene=dataclasses.replace(own.scene, **parts),
         links=own.links,
-        protocol=Protocol(views=40, wavelengths=()),
+        protocol=Protocol(views=views, largest_view_zenith=largest_view_zenith, wavelengths=()),
         parameters=parameters,
         noise=noise,
         seed=seed,
@@ -174,6 +181,28 @@ def test_a_body_that_is_not_there_has_no_alternative() -> None:
     row = criticize(fit).loc["alternatives"]
     assert row["level"] == "passed"
     assert "Depolarizer" in set(alternatives(fit)["alternative"])  # compared, and no news
+
+
+@pytest.mark.thorough
+def test_a_bare_surface_whose_roughness_a_body_widens_is_named() -> None:
+    """Few views do not exclude a body of .003, which leaves room for a wider highlight."""
+    bare = {"subsurface_fraction": 0.0, "roughness": 0.11, "refractive_index": 1.5}
+    fit = _fit("plastic", "camera", seed=2, parameters=bare, views=16, largest_view_zenith=80.0)
+    row = criticize(fit).loc["alternatives"]
+    assert row["level"] == "caution"
+    assert "nothing in the place of Lambertian (subsurface)" in row["sentence"]
+    told = alternatives(fit).set_index("alternative", append=True).xs("nothing", level=1)
+    sd = float(fit["posterior"]["roughness"].std())
+    assert told.loc["roughness", "other"] < told.loc["roughness", "mean"] - 1.96 * sd
+    setup = pb.setups.SETUPS["camera"]
+    scene = dataclasses.replace(setup.scene, subsurface=None, mixing=None)
+    own = dataclasses.replace(setup, scene=scene)
+    answer = pb.summary(pb.fit(capture_of(fit), scene=own, seed=0)).loc["roughness"]
+    assert answer["q2.5"] < bare["roughness"] < answer["q97.5"]
+
+
+def test_a_body_that_shines_is_not_compared_with_none(absorbing_body) -> None:
+    assert "nothing" not in set(alternatives(absorbing_body)["alternative"])
 
 
 @pytest.mark.thorough
