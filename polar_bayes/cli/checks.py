@@ -168,8 +168,8 @@ def budget(fit: Path, known: dict[str, float], as_json: bool) -> None:
     if as_json:
         print_json({"known": table.attrs["known"], "parameters": json_rows(table)})
         return
-    known_to = ", ".join(f"{name} {value:g}" for name, value in table.attrs["known"].items())
-    print_frame(table.T, [f"Known to: {known_to}."])
+    known_to = ", ".join(f"{name} {value:.2g}" for name, value in table.attrs["known"].items())
+    print_frame(table.T, [f"Standard uncertainties: {known_to}."])
 
 
 @command()

@@ -29,9 +29,9 @@ from polar_bayes.capture.schema import Interval
 from polar_bayes.errors import CaptureError
 
 UNDONE_UNCERTAINTY = 0.05
-"""Relative standard uncertainty of the gamma of frames whose curve is undone by its name. The
-curves of cameras differ from the standard of their files (Grossberg & Nayar 2004, IEEE TPAMI 26,
-1272): gammas of 1.96 (BT.709) to 2.2 are called the same."""
+"""Relative standard uncertainty of the gamma of frames whose curve is undone by its name, a
+judgment: the curves of cameras differ from the standard of their files (Grossberg & Nayar 2004,
+IEEE TPAMI 26, 1272)."""
 
 
 class Transfer(NamedTuple):

@@ -144,6 +144,7 @@ def test_scenes_are_compared_with_an_index_that_the_prior_excludes(
     """The fit keeps the prior that was stated, and its verdict says where that ends."""
     monkeypatch.setattr(selection, "scene_library", small_library)
     plate = plates([2.6], 0.01, np.arange(40.0, 82.0, 3.0)).isel(patch=0)
+    plate.attrs["setup"] = "paper"  # a perfect instrument
     result = pb.fit(plate, scene="auto", method="laplace", links=LINKS)
     scenes = result["scenes"].to_dataset()
     assert np.allclose(scenes["mean"].sel(parameter="refractive_index"), 2.6, atol=0.1)
