@@ -282,7 +282,9 @@ def test_an_interrupt_ends_the_process_of_a_trial(tmp_path, monkeypatch) -> None
 
     monkeypatch.setattr(run.subprocess, "Popen", Sleeping)
     monkeypatch.setattr(run.tempfile, "tempdir", str(tmp_path))
-    threading.Thread(target=interrupt).start()
+    thread = threading.Thread(target=interrupt)
+    thread.start()
     with pytest.raises(pb.FitError, match="its process ended with -9"):
         run.run_in_subprocess(None)
+    thread.join()
     assert not list(tmp_path.iterdir())

@@ -82,7 +82,8 @@ EVERY = [
 def case(name: str) -> Case:
     build, size = CASES[name]
     capture, asked = build()
-    request = resolve(capture, asked["model"], PLATE, PRIORS, asked["links"], None, 0, "double")
+    asked = capture, asked["model"], PLATE, PRIORS, asked["links"], None, 0, "double"
+    request = resolve(*asked, of_pixel=True)
     data = observe(request.capture)
     program = compile_program(request.bind(), data)
     assert program.size == size
