@@ -27,7 +27,7 @@ CODE = {
     "scenes": 1772,
     "own files": 1592,
     "models": 332,
-    "tests": 23036,
+    "tests": 23040,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
