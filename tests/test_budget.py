@@ -14,8 +14,8 @@ CODE = {
     "calibration": 1037,
     "capture": 834,
     "cli": 1270,
-    "design": 1134,
-    "diagnostics": 1879,
+    "design": 1135,
+    "diagnostics": 1877,
     "importers": 2102,
     "inference": 2755,
     "maps": 1703,
@@ -27,16 +27,16 @@ CODE = {
     "scenes": 1772,
     "own files": 1592,
     "models": 332,
-    "tests": 23040,
+    "tests": 23041,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25818,
+    "code": 25817,
     "classes": 334,
-    "constants": 425,
+    "constants": 424,
     "Any": 178,
-    "longest function": 81,
+    "longest function": 80,
 }
 """Limits of the whole package; the limit of `longest function` is in lines.
 

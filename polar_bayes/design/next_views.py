@@ -1,7 +1,7 @@
 """Optimal design of further views: those that narrow the posterior most.
 
-Fedorov exchange (Fedorov 1972) on a criterion of the expected covariance, averaged over draws of
-the posterior (Chaloner & Verdinelli 1995).
+Fedorov exchange (Fedorov 1972, Theory of Optimal Experiments) on a criterion of the expected
+covariance, averaged over draws of the posterior (Chaloner & Verdinelli 1995).
 """
 
 import dataclasses
@@ -58,9 +58,6 @@ from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 from polar_bayes.progress import Progress, with_progress
 from polar_bayes.scenes.scene_file import arguments_of
-
-WIDTH = 2.0 * 1.959963984540054
-"""Width of a normal distribution's 95% interval, in sds."""
 
 
 class Design(NamedTuple):
@@ -169,8 +166,7 @@ def next_views(
         FitError: Candidates, readings or constraints that cannot be used, or no mode was found.
 
     Source:
-        Fedorov (1972), Theory of Optimal Experiments; Chaloner & Verdinelli (1995), Statistical
-        Science 10, 273-304, for the average over the posterior.
+        Fedorov (1972); Chaloner & Verdinelli (1995), Statistical Science 10, 273-304.
     """
     _check_choice(count, draws, apart)
     if isinstance(capture, xr.DataTree):
@@ -220,12 +216,11 @@ def _selected(
     rows = [i for i, one in enumerate(scalars) if one.name in MATERIAL_PARAMETERS]
     rows = rows or list(range(len(scalars)))
     names, unit = [scalars[row].label for row in rows], extended.prior_sd[rows]
-    jacobian, places = design.jacobian, np.array(extended.rows)
-    design = design._replace(jacobian=jacobian[:, places[rows]])
-    known = request.standard_uncertainties(extended.program.supports)
-    known = {name: u for name, u in known.items() if name in extended.names}
-    errors = places[[extended.names.index(name) for name in known]]
-    halved = design.halved(jacobian[:, errors], np.array(list(known.values())))
+    places = dict(zip(extended.names, extended.rows, strict=True))
+    stated = request.standard_uncertainties(extended.program.supports)
+    known = {name: u for name, u in stated.items() if name in places}
+    slopes = design.jacobian[:, [places[name] for name in known]]
+    design = design._replace(jacobian=design.jacobian[:, [places[name] for name in names]])
 
     def loss(information: np.ndarray) -> np.ndarray:
         covariance = design.covariance(information) / np.outer(unit, unit)
@@ -247,8 +242,9 @@ def _selected(
     provenance = provenance_attrs(request, **asked, exchanges=selection.exchanges)
     found = _assemble(views, design, selection, names)
     if known:
-        found["uncertainty"] = ("quantity", list(known.values()))
-        found["halved_width"] = (("quantity", "parameter"), WIDTH * halved)
+        u = np.array(list(known.values()))
+        found["uncertainty"] = ("quantity", u)
+        found["halved_width"] = (("quantity", "parameter"), _width(design.halved(slopes, u)))
         found = found.assign_coords(quantity=list(known))
     return found.assign_attrs(provenance)
 
@@ -347,6 +343,11 @@ def _with_predicted_brightness(
     return dataclasses.replace(data, brightness=jax.lax.stop_gradient(brightness))
 
 
+def _width(sd: np.ndarray) -> np.ndarray:
+    """Return the width of a normal distribution's 95% interval."""
+    return 2.0 * 1.959963984540054 * sd
+
+
 def _assemble(
     views: CandidateViews, design: Design, selection: Selection, names: list[str]
 ) -> xr.Dataset:
@@ -360,7 +361,7 @@ def _assemble(
             "candidate": ("pick", at),
             "criterion": ("step", selection.losses),
             "expected_sd": (("step", "parameter"), np.sqrt(variance)),
-            "interval_width": (("step", "parameter"), WIDTH * np.sqrt(variance)),
+            "interval_width": (("step", "parameter"), _width(np.sqrt(variance))),
         },
         coords={"parameter": names, "step": np.arange(len(picks) + 1)},
     )

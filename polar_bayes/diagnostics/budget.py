@@ -176,9 +176,12 @@ def _share_of_noise(scalar: Scalar, densities: list[np.ndarray | None]) -> float
     return rates[0] / sum(rates) if sum(rates) > 0.0 else np.nan
 
 
-def better_known(fit: FitView, label: str) -> tuple[str, float]:
-    """What narrows a parameter most if it is known twice as well, in words; its sd by then."""
-    stated, row = _stated(fit), budget(fit).loc[label]
+def better_known(fit: FitView, row: pd.Series) -> tuple[str, float]:
+    """What narrows a parameter most if it is known twice as well, in words; its sd by then.
+
+    The row is that of the parameter in the budget.
+    """
+    stated = _stated(fit)
     halved = row[[f"{name}{HALVED}" for name in stated.index]].set_axis(stated.index)
     name = str(halved.idxmin())
     return known_to_half(_errors(fit)[name].name, stated[name]), float(halved[name])
@@ -201,25 +204,20 @@ def _sized(parameter: str, u: float) -> tuple[str, str]:
 
 
 @once
-def wider_by_setup(fit: FitView) -> pd.Series:
-    """Return factors by which the set-up widens uncertainties, largest first, if notable."""
-    if not has_budget(fit):
-        return pd.Series(dtype=float)
-    table = budget(fit)
-    ratio = (table["sd"] / table["perfect"]).where(table["perfect"] > 0.0)
-    return ratio[ratio > LIMITS.of_setup].sort_values(ascending=False)
-
-
-@once
 def budget_sentences(fit: FitView) -> tuple[str, ...]:
     """State what the set-up adds to intervals, where notable, and what to know better."""
-    wider = wider_by_setup(fit)
+    if not has_budget(fit):
+        return ()
+    table = budget(fit)
+    ratio = (table["sd"] / table["perfect"]).where(table["perfect"] > 0.0)
+    wider = ratio[ratio > LIMITS.of_setup].sort_values(ascending=False)
     if wider.empty:
         return ()
-    worst = str(wider.index[0])
-    (what, sd), now = better_known(fit, worst), budget(fit).loc[worst, "sd"]
+    worst = table.loc[wider.index[0]]
+    what, sd = better_known(fit, worst)
     factors = join([f"{label} {factor:.2g} times" for label, factor in wider.items()])
     return (
         "The uncertainty of the set-up makes standard uncertainties larger than those of a perfect "
-        f"one: {factors}. That of {worst} would be {sd:.2g} instead of {now:.2g} with the {what}.",
+        f"one: {factors}. That of {worst.name} would be {sd:.2g} instead of {worst['sd']:.2g} with "
+        f"the {what}.",
     )

@@ -152,7 +152,7 @@ def test_it_is_kept_in_a_file_and_the_verdict_names_what_to_know_better(fit, tmp
     assert sentence.startswith(
         "The uncertainty of the set-up makes standard uncertainties larger than"
     )
-    what, sd = better_known(view_of(fit), "refractive_index")
+    what, sd = better_known(view_of(fit), pb.budget(fit).loc["refractive_index"])
     assert what == "exponent of the sensor's tone curve known to 0.01 instead of 0.02"
     table = pb.budget(fit, known={"tone_curve": 0.01})
     assert sd == table.loc["refractive_index", "sd"]

@@ -87,14 +87,16 @@ def test_a_scene_without_alternatives_has_an_empty_table_and_a_point_fit_none() 
         alternatives(point)
 
 
+FORTY_VIEWS = Protocol(views=40, wavelengths=())
+
+
 def _fit(
     preset: str,
     setup: str,
     seed=0,
     parameters=None,
     noise=None,
-    views=40,
-    largest_view_zenith=85.0,
+    protocol=FORTY_VIEWS,
     **parts,
 ) -> xr.DataTree:
     """Fit a set-up to readings simulated with other parts or known parameters."""
@@ -105,7 +107,7 @@ def _fit(
         preset,
         scene=dataclasses.replace(own.scene, **parts),
         links=own.links,
-        protocol=Protocol(views=views, largest_view_zenith=largest_view_zenith, wavelengths=()),
+        protocol=protocol,
         parameters=parameters,
         noise=noise,
         seed=seed,
@@ -187,7 +189,8 @@ def test_a_body_that_is_not_there_has_no_alternative() -> None:
 def test_a_bare_surface_whose_roughness_a_body_widens_is_named() -> None:
     """Few views do not exclude a body of .003, which leaves room for a wider highlight."""
     bare = {"subsurface_fraction": 0.0, "roughness": 0.11, "refractive_index": 1.5}
-    fit = _fit("plastic", "camera", seed=2, parameters=bare, views=16, largest_view_zenith=80.0)
+    few = Protocol(views=16, largest_view_zenith=80.0, wavelengths=())
+    fit = _fit("plastic", "camera", seed=2, parameters=bare, protocol=few)
     row = criticize(fit).loc["alternatives"]
     assert row["level"] == "caution"
     assert "nothing in the place of Lambertian (subsurface)" in row["sentence"]
