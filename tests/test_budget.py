@@ -23,7 +23,7 @@ CODE = {
     "numerics": 1006,
     "observation": 515,
     "physics": 2766,
-    "reporting": 3274,
+    "reporting": 3272,
     "scenes": 1772,
     "own files": 1592,
     "models": 332,
@@ -32,7 +32,7 @@ CODE = {
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25817,
+    "code": 25815,
     "classes": 334,
     "constants": 424,
     "Any": 178,

@@ -443,23 +443,21 @@ def budget_table(fit: FitView) -> Table:
     for quantity, u in found.attrs["known"].items():
         descriptions[quantity] = ", ± ".join(described(fit, quantity, u))
 
-    is_halved = data.index.str.endswith(HALVED)
-    data, halved = data[~is_halved], data[is_halved]
+    # Beside its share of each variance stands what the sd would be.
+    labels, is_halved = list(data), data.index.str.endswith(HALVED)
+    halved = data[is_halved].rename(index=lambda name: name.removesuffix(HALVED))
+    data = data[~is_halved].join(halved.add_suffix(HALVED))
 
     def cell(label: str) -> Callable[[pd.Series], str]:
-        def sd(row: pd.Series) -> str:
-            return number(row[label], row[label])
-
         def of_row(row: pd.Series) -> str:
             if row.name in ("sd", "perfect"):
-                return sd(row)
-            better = f"{row.name}{HALVED}"
-            told = f" → {sd(halved.loc[better])}" if better in halved.index else ""
-            return f"{percent(row[label])}{told}"
+                return number(row[label], row[label])
+            better = row[f"{label}{HALVED}"]
+            return percent(row[label]) + (f" → {number(better, better)}" if better > 0.0 else "")
 
         return of_row
 
-    cells = {label: cell(label) for label in data.columns}
+    cells = {label: cell(label) for label in labels}
     return page.make_table("fit.budget", cells, data, label="source", descriptions=descriptions)
 
 
