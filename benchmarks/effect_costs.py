@@ -82,7 +82,7 @@ def gradients(scenes: list[pb.Scene], data: xr.Dataset) -> list[tuple[float, flo
     for scene in scenes:
         # The set-up of the capture would add its input quantities to every scene.
         arguments = (data, "per_material", scene, None, None, None, 0, "double")
-        request = resolve(*arguments, of_pixel=True)
+        request = resolve(*arguments, shared=())
         readings = observe(request.capture, largest_view_zenith=request.largest_view_zenith)
         program = compile_program(request.bind(), readings)
         z = np.zeros(program.size)

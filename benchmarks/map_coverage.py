@@ -1,6 +1,6 @@
 """Coverage of the intervals of a map, with and without the correction by weights.
 
-    python benchmarks/map_coverage.py plates camera shared
+    python benchmarks/map_coverage.py plates camera shared setup
 
     plates    ten thousand smooth plates drawn from the priors, with noise from .005 to .08
     camera    900 rough materials before a camera, by roughness: each pixel infers its own exposure,
@@ -9,10 +9,14 @@
     shared    100 images of ten thousand plates, each with a noise of its own, which all of its
               pixels share; beside maps whose pixels each infer it, and maps that are told; means
               of 25 regions of each
+    setup     900 rough materials in set-ups with errors, each pixel with its own: maps that take
+              the set-up for perfect, and maps that carry its errors; then ten camera images, each
+              with one set-up and one polarizer, and the means of all their pixels
 
 Without a part, all of them are run.
 """
 
+import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -26,6 +30,7 @@ from scipy import stats
 
 import polar_bayes as pb
 from polar_bayes.models.per_material import per_material
+from polar_bayes.physics.scene import MATERIAL_PARAMETERS
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from plate_images import ASKED, plate_image
@@ -132,6 +137,67 @@ def shared() -> None:
     print("sd of n over that of a map that is told the noise: shared, each its own", widths)
 
 
+ONE_SETUP, ONE_SIDE = 10, 24
+"""Images whose pixels share the errors of the set-up, and rows of each."""
+
+
+def image_with_errors(name: str, side: int, seed: int, *, of_pixels: bool) -> xr.Dataset:
+    """Rough materials in an imperfect set-up; its errors and gain are those of a pixel, or not."""
+    setup = pb.setups.SETUPS[name]
+    scene, priors = setup.scene.known_to(setup.known), {**pb.PRIORS, **setup.priors}
+    keys = jax.random.split(jax.random.key(seed), len(scene.parameters))
+    size, every = (side, side), zip(scene.parameters, keys, strict=True)
+    own = {"roughness", "subsurface_fraction", "refractive_index"}
+    drawn = [each for each in every if each[0] not in ("absorption", "concentration_scale")]
+    truth = {
+        name: np.asarray(priors[name].sample(key, size if of_pixels or name in own else ()), float)
+        for name, key in drawn
+    }
+    protocol = pb.simulation.Protocol(views=12, wavelengths=(), largest_view_zenith=75.0)
+    asked = {"scene": scene, "links": setup.links, "protocol": protocol, "parameters": truth}
+    return pb.simulate("plastic", **asked, seed=seed)
+
+
+def setup() -> None:
+    """Print the coverage of intervals in set-ups with errors."""
+    for name in ("camera", "polarimeter"):
+        usual = pb.setups.SETUPS[name]
+        image = image_with_errors(name, CAMERA_SIDE, 3, of_pixels=True)
+        for title, asked in (
+            ("taken for perfect", dataclasses.replace(usual, known=())),
+            ("errors carried", usual),
+        ):
+            begun = time.perf_counter()
+            maps = pb.fit_pixels(image, scene=asked, shared=())
+            print(f"{name}, {title}: {time.perf_counter() - begun:.0f} s with compilation")
+            print(pb.maps.count_pixels(maps), pb.maps.setup_sentences(maps))
+            print(pb.diagnostics.map_coverage(maps, image)[["answered", "held_95"]].round(3))
+    lamp = ("dolp_gain", "light_zenith_offset", "light_azimuth_offset")
+    one_setup("by default", None)
+    one_setup("lamp shared", lamp)
+
+
+def one_setup(title: str, shared: tuple[str, ...] | None) -> None:
+    """Print the coverage in images whose pixels share the errors of one set-up."""
+    scores, held, gains = [], [], []
+    for seed in range(ONE_SETUP):
+        image = image_with_errors("camera", ONE_SIDE, 100 + seed, of_pixels=False)
+        maps = pb.fit_pixels(image, scene="camera", shared=shared)
+        held.append(pb.diagnostics.map_coverage(maps, image)["held_95"])
+        good = maps["status"].to_numpy() == 0
+        means = pb.maps.region_means(maps, good).isel(region=0)
+        names = [name for name in MATERIAL_PARAMETERS if name in means]
+        apart = {n: float(means[n]) - image[f"true_{n}"].to_numpy()[good].mean() for n in names}
+        scores.append({n: apart[n] / float(means[f"{n}_sd"]) for n in names})
+        rows = pb.maps.shared_parameters(maps).iterrows()
+        true = ((row, float(image[f"true_{name}"])) for name, row in rows)
+        gains.append([row["q2.5"] <= x <= row["q97.5"] for row, x in true])
+    print(f"one set-up, {title}: pixels held", pd.DataFrame(held).mean().round(3).to_dict())
+    print("means of all pixels, in standard deviations of their intervals")
+    print(pd.DataFrame(scores).round(2))
+    print("what is shared held", gains)
+
+
 def plates() -> None:
     """Print the coverage of intervals of smooth plates."""
     noise = np.exp(np.random.default_rng(2).uniform(np.log(0.005), np.log(0.08), (SIDE, SIDE)))
@@ -142,7 +208,7 @@ def plates() -> None:
         print(pb.diagnostics.map_coverage(maps, image)[["held_50", "held_80", "held_95"]].round(3))
 
 
-PARTS = {"plates": plates, "camera": camera, "shared": shared}
+PARTS = {"plates": plates, "camera": camera, "shared": shared, "setup": setup}
 
 
 def main() -> None:

@@ -61,6 +61,8 @@ class Setup(HTMLRepr):
         shared: Instrument parameters that the pixels of an image share by default.
         known: Input quantities that every scene of this set-up has beside its own instrument;
             the widths of their priors are their standard uncertainties.
+        sampled: Names of those that every pixel of an image samples, since their effect is not
+            linear; the others move all pixels alike (`polar_bayes.fit_pixels`).
     """
 
     scene: Scene
@@ -69,6 +71,7 @@ class Setup(HTMLRepr):
     priors: Mapping[str, dist.Distribution] = dataclasses.field(default_factory=dict)
     shared: tuple[str, ...] = ()
     known: tuple[AbstractInputQuantity, ...] = ()
+    sampled: tuple[str, ...] = ()
 
 
 # A bare surface is as common as any body, and where it is one, the index must not follow a fraction
@@ -96,6 +99,7 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
                 AmbientLight(),
                 ToneCurve(),
             ),
+            sampled=("ambient_light",),  # in a bare pixel it is all of the light beside the lobe
         ),
         "camera": Setup(
             SCENES["camera"],

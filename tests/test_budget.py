@@ -13,28 +13,28 @@ CODE = {
     "benchmark": 580,
     "calibration": 1037,
     "capture": 834,
-    "cli": 1270,
+    "cli": 1273,
     "design": 1135,
     "diagnostics": 1877,
     "importers": 2102,
-    "inference": 2755,
-    "maps": 1703,
-    "methods": 1267,
+    "inference": 2769,
+    "maps": 1886,
+    "methods": 1280,
     "numerics": 1006,
     "observation": 515,
     "physics": 2766,
     "reporting": 3272,
     "scenes": 1772,
-    "own files": 1592,
-    "models": 332,
-    "tests": 23041,
+    "own files": 1595,
+    "models": 333,
+    "tests": 23157,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 25815,
-    "classes": 334,
-    "constants": 424,
+    "code": 26032,
+    "classes": 336,
+    "constants": 426,
     "Any": 178,
     "longest function": 80,
 }
@@ -42,7 +42,7 @@ WHOLE = {
 
 The plan was 20,500 lines of code, 290 classes and 180 `Any`, for a package that had 23,938 lines.
 Since then features came that were chosen over it: readers of other people's files (900 lines),
-the set-up in the interval (210), a map to point at (290), second bounces and passages (220),
+the set-up in the interval (210) and in maps (220), a map to point at (290), second bounces and passages (220),
 programs on the disk (90), exposures that are set for the light (40), and what is known better
 beside further views (70). The other rooms became smaller by a few lines only.
 """

@@ -190,6 +190,7 @@ def _in_setup(chosen: Any, scene: Any) -> Any:
     help="Noise or instrument parameter of the whole image; repeatable; none for none.  "
     "[default: those of the set-up]",
 )  # fmt: skip
+@known_option
 @seed_option
 @option("--precision", default="double", help="double or single.")
 @scheduler_option
@@ -222,9 +223,11 @@ def map_(
     for name, row in pb.maps.shared_parameters(maps).iterrows():
         interval = f"{row['q50']:.5g} [{row['q2.5']:.5g}, {row['q97.5']:.5g}]"
         click.echo(f"{name}: {interval} in all pixels, from {row['pixels']:.0f} of them")
-    for sentence in (*pb.maps.criticism_sentences(maps), *pb.maps.start_sentences(maps)):
-        say(sentence)
-    print_cautions([*pb.maps.shared_cautions(maps), *pb.maps.perfect_cautions(maps)])
+    sentences = pb.maps.criticism_sentences, pb.maps.start_sentences, pb.maps.setup_sentences
+    for of_maps in sentences:
+        for sentence in of_maps(maps):
+            say(sentence)
+    print_cautions(pb.maps.shared_cautions(maps))
 
 
 @command()

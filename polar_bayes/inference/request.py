@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Collection, Container, Mapping
 from numbers import Integral
 
 import jax
@@ -71,8 +71,10 @@ class Request(ModelParts):
     precision: str
     shared: tuple[str, ...]
     """Parameters of the set-up that the pixels of an image share by default."""
-    perfect: tuple[str, ...]
-    """Input quantities of the set-up that count as known perfectly."""
+    carried: Mapping[str, dist.Distribution]
+    """Priors of input quantities that a pixel does not sample: they move all pixels alike."""
+    with_setup: Scene
+    """The scene with those quantities."""
 
     def standard_uncertainties(self, sampled: Container[str]) -> dict[str, float]:
         """Return standard deviations of the priors of scalar parameters of the instrument."""
@@ -105,11 +107,11 @@ def resolve(
     precision: str,
     *,
     known: Mapping[str, float] | None = None,
-    of_pixel: bool = False,
+    shared: Collection[str] | None = None,
 ) -> Request:
     """Check the arguments of the caller, and fill in every default.
 
-    The set-up is known to standard uncertainties, which `known` replaces; a pixel's, perfectly.
+    A pixel, with names that an image shares, carries input quantities that it does not sample.
     """
     capture = validate(capture)
     if {"y", "x"} & set(map(str, capture.dims)):
@@ -124,9 +126,7 @@ def resolve(
         scene = str(capture.attrs.get("setup", UNSTATED))
     setup, scene_name = _find_scene(scene, capture)
     setup = as_read(setup, capture)
-    acting = [each for each in setup.known if all(name in capture for name in each.needs)]
-    if not of_pixel:
-        setup = dataclasses.replace(setup, scene=setup.scene.known_to(acting))
+    setup, whole = _known_to(setup, capture, shared)
     chosen = _choose_links(capture, setup, links)
     limit = setup.largest_view_zenith if largest_view_zenith is None else largest_view_zenith
     _check_settings(limit, precision, seed)
@@ -134,10 +134,12 @@ def resolve(
     function = model if callable(model) else _find_model(model)
     PriorTable(priors)  # refuses what names no priors
     given = dict(priors or {})
-    usual = (_pixel_priors() if of_pixel else {}) | default_priors(setup, capture, known)
+    usual = ({} if shared is None else _pixel_priors()) | default_priors(whole, capture, known)
+    carried = set(whole.scene.parameters) - set(setup.scene.parameters)
     same = {n: x for n, x in {**PRIORS, **usual}.items() if _are_same(given.get(n), x)}
     own = {name: prior for name, prior in given.items() if name not in same}
-    stated = {**usual, **own, **same}
+    every = usual | own | same
+    stated = {name: prior for name, prior in every.items() if name not in carried}
     parts = ModelParts(function, setup.scene, stated, chosen)
     with jax.enable_x64(precision == "double"):
         data = observe(capture, largest_view_zenith=limit, padded=parts.is_padded, described=chosen)
@@ -149,6 +151,7 @@ def resolve(
         "model": callable(model),
         "links": links is not None and chosen != _usual_links(capture, setup),
         **{f"prior of {name}": True for name in own},
+        **{f"uncertainty of {name} ({u:g})": True for name, u in (known or {}).items()},
         **{f"{name} held fixed": True for name in found.fixed},
     }
     return Request(
@@ -162,6 +165,8 @@ def resolve(
             found.priors,
             {n: prior for n, prior in stated.items() if n in found.priors or n in given},
         ),
+        carried={n: {**PRIORS, **every}[n] for n in whole.scene.parameters if n in carried},
+        with_setup=whole.scene,
         declared=found.declared,
         fixed=found.fixed,
         links=chosen,
@@ -170,8 +175,20 @@ def resolve(
         seed=int(seed),
         precision=precision,
         shared=tuple(name for name in setup.shared if name in found.priors),
-        perfect=tuple(each.name for each in acting) if of_pixel else (),
     )
+
+
+def _known_to(
+    setup: Setup, capture: xr.Dataset, shared: Collection[str] | None
+) -> tuple[Setup, Setup]:
+    """The set-up with input quantities that a fit, or a pixel, samples, and with all of them."""
+    acting = [each for each in setup.known if all(name in capture for name in each.needs)]
+    of_pixel = acting
+    if shared is not None:
+        names = {*shared, *(f"{name}_offset" for name in setup.sampled)}
+        of_pixel = [each for each in acting if names & set(each.parameters)]
+    some, every = (setup.scene.known_to(each) for each in (of_pixel, acting))
+    return dataclasses.replace(setup, scene=some), dataclasses.replace(setup, scene=every)
 
 
 def _pixel_priors() -> dict[str, dist.Distribution]:

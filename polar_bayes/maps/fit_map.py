@@ -4,6 +4,7 @@ import dataclasses
 import enum
 import functools
 import json
+import operator
 from collections.abc import Callable, Mapping, Sequence
 
 import dask.array as da
@@ -29,8 +30,15 @@ from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.maps.blocks import as_completed, workers
 from polar_bayes.maps.criticism import PROBLEMS, Criticism, PixelCriticism
 from polar_bayes.maps.lazy import DISAGREEMENT, UNKNOWN
+from polar_bayes.maps.propagation import Carried, Propagation, carried
 from polar_bayes.maps.shared import PIXELS as SHARED_PIXELS
-from polar_bayes.maps.shared import SharedParameter, as_priors, estimate_shared, of_priors
+from polar_bayes.maps.shared import (
+    SharedParameter,
+    as_priors,
+    estimate_shared,
+    moved_by_setup,
+    of_priors,
+)
 from polar_bayes.methods.corrected_laplace import CorrectedLaplace
 from polar_bayes.methods.method import AbstractBatchMethod, find_method, name_of
 from polar_bayes.methods.registry import MAP_DEFAULT
@@ -74,6 +82,7 @@ def fit_pixels(
     seed: int = 0,
     precision: str = "double",
     shared: str | Sequence[str] | None = None,
+    known: Mapping[str, float] | None = None,
     progress: Counter | None = None,
 ) -> xr.Dataset:
     """Fit every pixel of an image separately.
@@ -81,7 +90,8 @@ def fit_pixels(
     Each pixel is the fit that `polar_bayes.fit` makes of it, by the Laplace approximation at its
     mode, corrected, unless `method` says otherwise: the same model, priors and links. Parameters in
     `shared` are one unknown of the whole image: their posterior, estimated from 512 pixels drawn at
-    random, is the prior of every pixel. A map has the marginals of each pixel, from which
+    random, is the prior of every pixel. Errors of the set-up, such as that of a lamp's direction,
+    move all pixels alike, to first order. A map has the marginals of each pixel, from which
     `maps.region_means` tells means and contrasts of regions.
 
     Args:
@@ -97,16 +107,17 @@ def fit_pixels(
         largest_view_zenith: Views beyond it are set aside. Unit degree.
         seed: The same seed gives the same maps, however the image is cut.
         precision: "double" or "single".
-        shared: Parameters of the noise or instrument, such as `("stokes_scale", "dolp_gain")`,
-            that have one value in all of the image; `()` for none. By default those of the set-up
-            (`Setup.shared`) in images of at least 512 pixels, as long as pixels agree about them;
-            `maps.shared_cautions` tells where they do not.
+        shared: Parameters of the noise or instrument, such as `("stokes_scale", "dolp_gain")` or
+            `("light_zenith_offset",)`, that have one value in all of the image; `()` for none. By
+            default those of the set-up (`Setup.shared`) in images of at least 512 pixels, as long
+            as pixels agree about them; `maps.shared_cautions` tells where they do not.
+        known: Standard uncertainties of input quantities of the set-up, see `polar_bayes.fit`.
         progress: Called with the pixels that are done, and all.
 
     Returns:
         For each parameter its mean `<name>`, `<name>_sd` and `<name>_quantile`, each (y, x, ...);
         what is shared has no map, and is told by `maps.shared_parameters`; `<name>_slope` is the
-        change of the mean with one standard deviation of each shared parameter;
+        change of the mean with one sd of each shared parameter and input quantity;
         `pareto_k`, `ess`, `condition`, `steps`, `method` (the method by which the
         numbers were found) and `status` of each pixel; `criticism`, the checks in which its
         readings speak against the model (`maps.count_criticism`). NaN where a pixel has no answer;
@@ -118,7 +129,17 @@ def fit_pixels(
         FitError: A model, prior, link or setting cannot be used.
     """
     asked = plan_map(
-        capture, model, method, scene, priors, links, largest_view_zenith, seed, precision, shared
+        capture,
+        model,
+        method,
+        scene,
+        priors,
+        links,
+        largest_view_zenith,
+        seed,
+        precision,
+        shared,
+        known,
     )
     plan = estimate_plan(asked, capture)
     if capture.chunks:
@@ -141,13 +162,15 @@ class MapPlan:
     intensity_unit: float | None = dataclasses.field(compare=False)
     own_directions: frozenset[str] = dataclasses.field(compare=False)
     shared: tuple[SharedParameter, ...] = ()
+    carried: tuple[Carried, ...] = ()
     shares_by_default: bool = dataclasses.field(default=False, compare=False)
     found: Mapping[str, object] = dataclasses.field(default_factory=dict, compare=False)
 
     def sharing(self, names: Sequence[str]) -> "MapPlan":
         """Return the request with these parameters shared by all pixels."""
         own, no_unit = sorted(self.own_directions), self.intensity_unit is None
-        key = layout_key(self.request, own, no_unit, tuple(names))
+        setup = repr(self.request.with_setup) if self.carried else ""
+        key = layout_key(self.request, own, no_unit, tuple(names), setup)
         shared = tuple(of_priors(names, self.request.priors))
         return dataclasses.replace(self, key=key, shared=shared)
 
@@ -163,7 +186,8 @@ class MapPlan:
         """Return empty marginals of a number of pixels."""
         priors = self.request.priors
         scores = [functools.partial(each.scores, priors[each.name]) for each in self.shared]
-        return Marginals(count, self.sizes, scores=scores)
+        errors = [operator.itemgetter(each.name) for each in self.carried]
+        return Marginals(count, self.sizes, scores=[*scores, *errors])
 
     def batch(self, image: xr.Dataset, numbers: np.ndarray | None = None) -> ProblemBatch:
         """The pixels of an image, or of a block, row by row; `numbers` are theirs in the whole."""
@@ -172,15 +196,29 @@ class MapPlan:
         every = np.arange(len(pixels)) if numbers is None else numbers
         return problem_batch(self.engine, pixels, every, self.request.seed)
 
+    def propagation(self, batch: ProblemBatch) -> Propagation:
+        """What errors of the set-up do to pixels."""
+        moves = ((each, each.by_setup.values()) for each in self.shared if each.by_setup)
+        slopes = {each.name: [-x / each.sd**2 for x in own] for each, own in moves}
+        return Propagation(batch, self.with_setup, self.carried, slopes)
+
+    @property
+    def with_setup(self) -> CompiledModel:
+        """The model of a pixel whose set-up has errors, around zero."""
+        # Each has a normal prior: the coordinate of what only adds has no value at zero.
+        normal = {name: dist.Normal(0.0, 1.0) for name in self.request.carried}
+        priors = {**self.request.priors, **normal}
+        asked = dataclasses.replace(self.request, scene=self.request.with_setup, priors=priors)
+        return compile_layout(f"{self.key} with its set-up", asked, self._pixel)
+
     @property
     def engine(self) -> CompiledModel:
         """The compiled model, made at first use in each process."""
+        return compile_layout(self.key, self.request, self._pixel)
 
-        def pixel() -> Observations:
-            with jax.enable_x64(True):
-                return self.observe(self.request.capture)
-
-        return compile_layout(self.key, self.request, pixel)
+    def _pixel(self) -> Observations:
+        with jax.enable_x64(True):
+            return self.observe(self.request.capture)
 
     @property
     def axes(self) -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
@@ -206,6 +244,7 @@ def plan_map(
     seed: int,
     precision: str,
     shared: str | Sequence[str] | None = None,
+    known: Mapping[str, float] | None = None,
 ) -> MapPlan:
     """Check the request of a map on one of its pixels."""
     settings = find_method(MAP_DEFAULT if method is None else method, "fit_pixels", many=True)
@@ -216,17 +255,22 @@ def plan_map(
         raise CaptureError(what, where=str(capture.attrs.get("name", "capture")), hint=hint)
     pixel, limit = _fullest_pixel(capture), largest_view_zenith
     asked = pixel, model, scene, priors, links, limit, seed, precision
-    request = resolve(*asked, of_pixel=True)  # pixels have no input quantities of their own
-    known = (name for name in (*ANGLES, "normal_confidence") if name in capture)
-    own = frozenset(name for name in known if set(IMAGE) & set(capture[name].dims))
-    unit = _intensity_unit(capture)
-    plan = MapPlan("", request, settings, unit, own, shares_by_default=shared is None)
-    if shared is None:
-        is_large = capture.sizes["y"] * capture.sizes["x"] >= SHARED_PIXELS
-        return plan.sharing(request.shared if is_large else ())
-    names = (shared,) if isinstance(shared, str) else tuple(shared)
+    names = (shared,) if isinstance(shared, str) else tuple(shared or ())
+    request = resolve(*asked, known=known, shared=names)
     _check_shared(names, request)
-    return plan.sharing(names)
+    stated = (name for name in (*ANGLES, "normal_confidence") if name in capture)
+    own = frozenset(name for name in stated if set(IMAGE) & set(capture[name].dims))
+    unit, quantities, is_usual = _intensity_unit(capture), carried(request.carried), shared is None
+    plan = MapPlan("", request, settings, unit, own, carried=quantities, shares_by_default=is_usual)
+    is_large = capture.sizes["y"] * capture.sizes["x"] >= SHARED_PIXELS
+    if is_usual and is_large:
+        names = request.shared
+    plan = plan.sharing(names)
+    # A model of the user's own need not know of them.
+    sites = plan.with_setup.program.positions if quantities else {}
+    return dataclasses.replace(
+        plan, carried=tuple(each for each in quantities if each.name in sites)
+    )
 
 
 def estimate_plan(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
@@ -249,7 +293,8 @@ def _check_shared(names: Sequence[str], request: Request) -> None:
 def _with_shared(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
     """Add the posterior of shared parameters, estimated from pixels drawn at random."""
     request, settings = plan.request, plan.settings
-    batch = plan.batch(_random_pixels(capture, request.seed, SHARED_PIXELS))
+    pixels = _random_pixels(capture, request.seed, SHARED_PIXELS)
+    batch = plan.batch(pixels)
     method = settings if isinstance(settings, CorrectedLaplace) else CorrectedLaplace()
     try:
         found = estimate_shared(batch, method, request.priors, plan.shared)
@@ -260,7 +305,12 @@ def _with_shared(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
     most = max(each.disagreement for each in found)
     if plan.shares_by_default and most > DISAGREEMENT:
         return _sharing_nothing(plan, f"pixels do not agree (information matrix test {most:.1f})")
-    return dataclasses.replace(plan, shared=tuple(found))
+    plan = dataclasses.replace(plan, shared=tuple(found))
+    if not plan.carried:
+        return plan
+    batch = plan.batch(pixels)
+    moved = moved_by_setup(batch, method, request.priors, found, plan.propagation(batch))
+    return dataclasses.replace(plan, shared=tuple(moved))
 
 
 def _sharing_nothing(plan: MapPlan, reason: str) -> MapPlan:
@@ -344,18 +394,19 @@ def provenance_json(plan: MapPlan) -> str:
         "largest_view_zenith": request.largest_view_zenith,
         "precision": request.precision,
         "intensity_unit": plan.intensity_unit,
-        "shared": {each.name: _described(each, request) for each in plan.shared},
+        "shared": {each.name: _described(each, plan) for each in plan.shared},
         "shared_by_default": plan.shares_by_default,
-        "perfect": list(request.perfect),
+        "carried": {each.name: each.sd for each in plan.carried},
         **plan.found,
     }
     return json.dumps(provenance, sort_keys=True)
 
 
-def _described(parameter: SharedParameter, request: Request) -> dict[str, object]:
+def _described(parameter: SharedParameter, plan: MapPlan) -> dict[str, object]:
     """Describe a shared parameter in types of JSON."""
+    prior = plan.request.priors[parameter.name]
     with jax.enable_x64(True):
-        quantiles = parameter.quantiles(request.priors[parameter.name], LEVELS)
+        quantiles = parameter.quantiles(prior, LEVELS, plan.carried)
     return {
         "quantiles": dict(zip(map(str, LEVELS), quantiles.tolist(), strict=True)),
         "pixels": parameter.pixels,
@@ -427,7 +478,12 @@ def fit_block(block: xr.Dataset, plan: MapPlan) -> xr.Dataset:
     criticism = PixelCriticism(batch, found)
     outcome = Outcome(len(batch))
     criticism.begin_compiling()
+    propagation = plan.propagation(batch) if plan.carried else None
+    if propagation:
+        propagation.begin_compiling()
     for part in plan.settings.fit_batch(batch):
+        if propagation:
+            part = propagation.move(part)
         outcome.put(part)
         draws = {name: np.asarray(x) for name, x in part.draws.items()}
         if draws:
@@ -462,7 +518,7 @@ def maps_of(
             ("_sd", "standard deviation of", found.sd[name], ()),
             ("_quantile", "quantiles of", found.quantiles[name], ("quantile",)),
         ]
-        if plan.shared:
+        if plan.shared or plan.carried:
             what = "change with one sd of what is shared of"
             statistics.append(("_slope", what, found.slopes[name], ("shared",)))
         for ending, statistic, values, first in statistics:
@@ -480,7 +536,7 @@ def maps_of(
     variables["criticism"] = (IMAGE, criticism.reshape(shape), attrs)
     coords = {dim: block.coords[dim] for dim in (*IMAGE, "wavelength") if dim in block.coords}
     found_maps = xr.Dataset(variables, coords={**coords, "quantile": list(LEVELS)})
-    names = [each.name for each in plan.shared]
+    names = [*(each.name for each in plan.shared), *(each.name for each in plan.carried)]
     return found_maps.assign_coords(shared=names) if names else found_maps
 
 

@@ -20,6 +20,7 @@ from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.numerics.psis import LEVELS
 from polar_bayes.observation.data import READINGS
 from polar_bayes.paths import as_path
+from polar_bayes.physics.scene import MATERIAL_PARAMETERS
 
 zarr = lazy_loader.load("zarr")  # 0.1 s that results of other kinds need not wait for
 
@@ -359,15 +360,48 @@ def shared_cautions(maps: xr.Dataset) -> list[str]:
     ]
 
 
-def perfect_cautions(maps: xr.Dataset) -> list[str]:
-    """Caution that no interval of a pixel holds what the set-up is known to."""
-    perfect = provenance_of(maps).get("perfect")
-    if not perfect:
+def setup_shares(maps: xr.Dataset) -> pd.DataFrame:
+    """Return how much of the variance of an image's pixels errors of the set-up make.
+
+    Args:
+        maps: Of `fit_pixels`, or opened from a store, which is read block by block.
+
+    Returns:
+        A row for each parameter, and a column for each input quantity that moves all pixels alike:
+        the sum of its contributions to the variance over that of the variances of all pixels with
+        an answer. Empty where the set-up has none.
+
+    Raises:
+        FitError: The provenance of the map, or a chunk, cannot be read.
+    """
+    quantities = list(provenance_of(maps).get("carried") or {})
+    names = map_parameters(maps) if quantities else []
+    parts, whole = np.zeros((len(names), len(quantities))), np.zeros((len(names), 1))
+    for place in cut(maps, CHUNK) if names else ():
+        block = maps.isel(place)
+        good = checked_status(block) == Status.GOOD
+        for row, name in enumerate(names):
+            slope = block[f"{name}_slope"].sel(shared=quantities).where(good).astype(float)
+            sd = block[f"{name}_sd"].where(good).astype(float)
+            parts[row] += (slope**2).sum([d for d in slope.dims if d != "shared"]).to_numpy()
+            whole[row] += float((sd**2).sum())
+    share = np.divide(parts, whole, out=np.full(parts.shape, np.nan), where=whole > 0.0)
+    return pd.DataFrame(share, names, quantities)
+
+
+def setup_sentences(maps: xr.Dataset) -> list[str]:
+    """State what errors of the set-up contribute to the intervals of the material."""
+    shares = setup_shares(maps)
+    shares = shares.loc[[name for name in MATERIAL_PARAMETERS if name in shares.index]].dropna()
+    if shares.empty:
         return []
+    parts = [
+        f"{row.sum():.0%} of {name} (most by {row.idxmax().removesuffix('_offset')})"
+        for name, row in shares.iterrows()
+    ]
     return [
-        f"Each pixel takes the set-up for perfectly known: {', '.join(perfect)}. Errors of these "
-        "move all pixels alike, and no interval of a pixel holds them. The fit of the mean of a "
-        "region has them among its parameters."
+        "Intervals hold errors of the set-up, which are the same in all pixels: of the variance of "
+        f"pixels they make {', '.join(parts)}."
     ]
 
 

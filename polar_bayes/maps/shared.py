@@ -24,6 +24,7 @@ Source:
 
 import dataclasses
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -40,6 +41,7 @@ from polar_bayes.inference.batching import LANES, Status, batched
 from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.problem_batch import Outcome, ProblemBatch
 from polar_bayes.inference.program import Program, Values
+from polar_bayes.maps.propagation import Carried, Propagation
 from polar_bayes.methods.corrected_laplace import CorrectedLaplace
 from polar_bayes.numerics.batches import AnyArray, map_elements
 from polar_bayes.numerics.compile import JitOnce
@@ -75,6 +77,7 @@ class SharedParameter:
         pixels: From which it was estimated.
         disagreement: Information matrix test, a standard normal number where all pixels have one
             value of the parameter, and large where they have several.
+        by_setup: By how much the mean moves with one standard deviation of each input quantity.
     """
 
     name: str
@@ -82,20 +85,27 @@ class SharedParameter:
     sd: float
     pixels: int = 0
     disagreement: float = 0.0
+    by_setup: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
-    def quantiles(self, prior: dist.Distribution, levels: Sequence[float]) -> np.ndarray:
-        """Return quantiles of the parameter."""
-        scores = self.mean + self.sd * scipy.special.ndtri(np.asarray(levels))
+    def quantiles(
+        self, prior: dist.Distribution, levels: Sequence[float], setup: Sequence[Carried] = ()
+    ) -> np.ndarray:
+        """Return quantiles of the parameter in a set-up with these input quantities."""
+        moves = [(self.by_setup.get(each.name, 0.0), each.mean / each.sd) for each in setup]
+        mean = self.mean + sum(move * score for move, score in moves)
+        sd = math.hypot(self.sd, *(move for move, _ in moves))
+        scores = mean + sd * scipy.special.ndtri(np.asarray(levels))
         return np.asarray(_values(dist.biject_to(prior.support), scores), float)
 
     def scores(self, prior: dist.Distribution, draws: Values) -> np.ndarray:
-        """Return standard scores of draws, in the shape of the draws."""
+        """Return standard scores of draws, in the shape of the draws, given the set-up's errors."""
         # Some pixels have as many draws as they need, and JAX compiles for each length: those of
         # 2**14 are computed together.
         with jax.enable_x64(True):
             inverse = functools.partial(_coordinates_of, dist.biject_to(prior.support))
             x = map_elements(inverse, np.asarray(draws[self.name], float), 2**14)
-        return (x - self.mean) / self.sd
+        moved = sum(move * draws[name] for name, move in self.by_setup.items())
+        return (x - self.mean - moved) / self.sd
 
 
 # Compiled as a whole: by themselves, their operations are dozens of programs for each shape.
@@ -219,6 +229,37 @@ def estimate_shared(
     raise FitError(f"their search has not settled in {MOST_STEPS} steps", where=where, hint=hint)
 
 
+def moved_by_setup(
+    batch: ProblemBatch,
+    method: CorrectedLaplace,
+    priors: Mapping[str, dist.Distribution],
+    shared: Sequence[SharedParameter],
+    propagation: Propagation,
+) -> list[SharedParameter]:
+    """Return shared parameters with what errors of the set-up do to them.
+
+    Each pixel's part is the Schur complement of the block of its own parameters, at its mode.
+    """
+    names = tuple(each.name for each in shared)
+    once, size = dataclasses.replace(method, sampler=None, starts=1), batch.engine.program.size
+    z, root = np.full((len(batch), size), np.nan), np.full((len(batch), size, size), np.nan)
+    for found in once.run_batch(batch):
+        if found.mode is not None:
+            z[found.at], root[found.at] = found.mode
+    good = np.flatnonzero(np.isfinite(root).all(axis=(1, 2)))
+    response = propagation.response(good, z[good], root[good])
+    at = _positions(batch.engine.program, names)
+    known = np.linalg.inv((np.swapaxes(root[good], 1, 2) @ root[good])[:, at[:, None], at])
+    prior = np.diag([each.sd**-2.0 for each in shared])
+    _, curvature = _prior_derivatives(names, priors, np.array([each.mean for each in shared]))
+    whole = curvature + np.sum(known - prior, axis=0)
+    moves = np.linalg.solve(whole, np.sum(known @ response[:, at], axis=0))
+    return [
+        dataclasses.replace(each, by_setup=dict(zip(propagation.names, row, strict=True)))
+        for each, row in zip(shared, moves.tolist(), strict=True)
+    ]
+
+
 def _precision(information: np.ndarray) -> np.ndarray:
     """Return the inverse variance of each parameter; infinite where it is not positive."""
     if not np.linalg.eigvalsh(information)[0] > 0.0:
@@ -283,16 +324,15 @@ def _expectations(
             ends[found.at] = found.mode[0]
         if found.at.size and found.draws:
             rows, which = np.arange(found.at.size)[:, None], _resampled(found.weights)
-            values = {n: np.asarray(found.draws[n])[rows, which] for n in engine.program.supports}
-            every[found.at] = batch.subset(found.at).run(_coordinates, None, values)
+            every[found.at] = np.asarray(found.z)[rows, which]
     good = np.flatnonzero(outcome.status == Status.GOOD)
     names = tuple(each.name for each in shared)
     if not good.size:
         return _Expectations(*(np.zeros((0, len(names))) for _ in range(5))), ends
     z = every[good]
-    coordinates = z[..., _positions(engine.program, names)].astype(float)
-    mean = coordinates.mean(axis=1)
-    centered = coordinates - mean[:, None]
+    x = z[..., _positions(engine.program, names)].astype(float)
+    mean = x.mean(axis=1)
+    centered = x - mean[:, None]
     covariance = np.einsum("pdi,pdj->pij", centered, centered) / (DRAWS - 1)
     slope, error, information = batch.subset(good).run(_slopes, names, z)
     return _Expectations(slope, error, information, mean, covariance), ends
@@ -306,16 +346,6 @@ def _resampled(weights: np.ndarray) -> np.ndarray:
     rows = np.take_along_axis(weights, order, axis=1)
     chosen = np.stack([systematic_resample(row, DRAWS) for row in rows])
     return np.take_along_axis(order, chosen, axis=1)
-
-
-def _coordinates(engine: CompiledModel, _: None) -> JitOnce:
-    """Make the program that returns unconstrained vectors of the draws of one pixel."""
-
-    def of_pixel(data: Observations, draws: dict[str, Array]) -> Array:
-        # A transform does not depend on readings.
-        return jax.vmap(engine.program.unconstrain)(draws)
-
-    return batched(of_pixel, lanes=LANES)
 
 
 def _positions(program: Program, names: Sequence[str]) -> np.ndarray:

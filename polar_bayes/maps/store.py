@@ -198,6 +198,7 @@ class _MapStore:
             "seed": str(request.seed),
             "precision": request.precision,
             "shared": f"{[each.name for each in plan.shared]}, {plan.shares_by_default}",
+            "set-up": repr(plan.carried),
         }
         self.request = digest(self.topics)
 

@@ -252,6 +252,7 @@ class _Run:
         )
         found, trusted = take_rows(found, converged), found.is_trusted[converged]
         mode = found.search.mode
+        proposal = _proposal_at(mode).rotated(self.rotations[converged])
         yield BatchDraws(
             self.at[converged],
             np.where(trusted, Status.GOOD, Status.NOT_TRUSTED),
@@ -264,6 +265,7 @@ class _Run:
             mode.condition,
             found.search.steps,
             (mode.z, mode.root),
+            proposal.draws(self.points),
         )
 
     def adapt(
@@ -289,7 +291,11 @@ class _Run:
             if self.settings.sampler is not None and enough.any():
                 enough[enough] = ~self._has_arm(some[enough], take_rows(proposal, enough))
             answers = take_rows((parameters, weights, effective), enough)
-            yield BatchDraws(self.at[some[enough]], Status.GOOD, *answers, MethodUsed.ADAPTED)
+            at, mode = self.at[some[enough]], take_rows(normal.search.mode, left[enough])
+            z = take_rows(proposal, enough).draws(points)
+            yield BatchDraws(
+                at, Status.GOOD, *answers, MethodUsed.ADAPTED, mode=(mode.z, mode.root), z=z
+            )
             left, weights, proposal = take_rows((left, weights, proposal), ~enough)
         return left
 

@@ -81,23 +81,25 @@ class Laplace(AbstractMethod):
         heaviest = np.unique(owner, return_index=True)[1]
         found, modes = batch.subset(owner[heaviest]), take_rows(modes, heaviest)
         count, mode = self.chains * self.draws, (np.asarray(modes.z), np.asarray(modes.root))
+        z, draws = found.run(_normal_draws, count, *mode, found.keys)
         yield BatchDraws(
             found.at,
             Status.GOOD,
-            found.run(_normal_draws, count, *mode, found.keys),
+            draws,
             np.full((len(found), count), 1.0 / count),
             float(count),
             MethodUsed.LAPLACE,
             condition=np.asarray(modes.condition),
             mode=mode,
+            z=z,
         )
 
 
 def _normal_draws(engine: CompiledModel, count: int) -> JitOnce:
     """Make the program that draws from the approximation of one capture."""
 
-    def draw(data: Observations, z: Array, root: Array, key: Array) -> Values:
-        noise = jax.random.normal(key, (count, len(z)), z.dtype)
-        return jax.vmap(lambda z: engine.program.parameters(z, data))(z + noise @ root)
+    def draw(data: Observations, z: Array, root: Array, key: Array) -> tuple[Array, Values]:
+        z = z + jax.random.normal(key, (count, len(z)), z.dtype) @ root
+        return z, jax.vmap(lambda z: engine.program.parameters(z, data))(z)
 
     return batched(draw)

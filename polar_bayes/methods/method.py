@@ -23,6 +23,7 @@ from polar_bayes.inference.program import THREADS, Values
 from polar_bayes.inference.request import MIN_VIEWS
 from polar_bayes.inference.result import Provenance
 from polar_bayes.methods.registry import METHODS, method_names
+from polar_bayes.numerics.batches import AnyArray
 from polar_bayes.numerics.compile import TRACING_LOCK
 from polar_bayes.numerics.mcse import (
     LARGEST_R_HAT,
@@ -284,8 +285,8 @@ class AbstractMethod(AbstractBatchMethod):
             if not finite_draws(parameters).any():
                 return None
             status, effective, method = assess_draws(draws, parameters)
-            thinned = thin_draws(parameters, effective)
-            count = len(next(iter(thinned.values())))
+            z, thinned = thin_draws(draws.z, parameters, effective)
+            count = len(z)
             return BatchDraws(
                 batch.at[[row]],
                 status,
@@ -294,6 +295,7 @@ class AbstractMethod(AbstractBatchMethod):
                 effective,
                 method,
                 draws.pareto_k,
+                z=z[None],
             )
 
         yield from (found for found in _THREADS.map(run, range(len(batch))) if found is not None)
@@ -320,15 +322,18 @@ def assess_draws(draws: PosteriorDraws, parameters: Values) -> tuple[Status, flo
     return Status.GOOD if good else Status.NOT_TRUSTED, effective, method
 
 
-def thin_draws(parameters: Values, effective: float) -> dict[str, np.ndarray]:
-    """Return nearly independent finite draws of all chains by name, (draw, ...)."""
+def thin_draws(
+    z: AnyArray, parameters: Values, effective: float
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return nearly independent finite draws of all chains, also by name, (draw, ...)."""
     finite = finite_draws(parameters)
     step = int(np.ceil(finite.size / np.clip(effective, 1.0, finite.size)))
     chosen = np.zeros_like(finite)
     chosen[:, ::step] = True
     if not (chosen & finite).any():
         chosen[:] = True
-    return {name: np.asarray(x)[chosen & finite] for name, x in parameters.items()}
+    kept = chosen & finite
+    return np.asarray(z)[kept], {name: np.asarray(x)[kept] for name, x in parameters.items()}
 
 
 def finite_draws(parameters: Values) -> np.ndarray:

@@ -25,7 +25,7 @@ from polar_bayes.maps.lazy import (
     criticism_sentences,
     ensure_loaded,
     map_parameters,
-    perfect_cautions,
+    setup_sentences,
     shared_cautions,
     shared_parameters,
     start_sentences,
@@ -239,6 +239,7 @@ def map_page(
         *text.pixel_sentences(counts),
         *criticism_sentences(maps),
         *start_sentences(maps),
+        *setup_sentences(maps),
     ]
     coverage: list[page.Block] = []
     if truth is not None:
@@ -273,7 +274,6 @@ def map_page(
         cautions=[
             *([page.caption("map.unchecked")] if method == UNCHECKED else []),
             *shared_cautions(maps),
-            *perfect_cautions(maps),
         ],
         sections=sections,
         footer="Computed from the maps of every pixel, which stay where they are.",

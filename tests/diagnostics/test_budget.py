@@ -173,7 +173,9 @@ def test_a_capture_states_what_its_set_up_is_known_to(capture: xr.Dataset) -> No
 def test_what_only_adds_is_known_to_its_standard_deviation(capture: xr.Dataset) -> None:
     setup = Setup(PLATE, LINKS, known=(AmbientLight(),))
     asked = ("per_material", setup, None, None, None, 0, "double")
-    prior = resolve(capture, *asked, known={"ambient_light": 0.01}).priors["ambient_light_offset"]
+    request = resolve(capture, *asked, known={"ambient_light": 0.01})
+    assert "uncertainty of ambient_light (0.01)" in request.swapped
+    prior = request.priors["ambient_light_offset"]
     np.testing.assert_allclose(np.sqrt(prior.variance), 0.01, rtol=1e-6)  # single precision
     assert type(prior) is type(pb.PRIORS["ambient_light_offset"])
 

@@ -83,7 +83,7 @@ def case(name: str) -> Case:
     build, size = CASES[name]
     capture, asked = build()
     asked = capture, asked["model"], PLATE, PRIORS, asked["links"], None, 0, "double"
-    request = resolve(*asked, of_pixel=True)
+    request = resolve(*asked, shared=())
     data = observe(request.capture)
     program = compile_program(request.bind(), data)
     assert program.size == size

@@ -313,12 +313,3 @@ def test_what_cannot_be_mapped_is_refused_with_the_mend(change, settings: dict, 
     with pytest.raises(pb.PolarBayesError, match=says) as caught:
         fit_pixels(change(image) if change else image, **{**ASKED, **settings})
     assert "\n" not in str(caught.value)
-
-
-def test_a_map_says_what_it_takes_for_perfectly_known(image: xr.Dataset) -> None:
-    """Nothing is computed: a map in chunks knows its provenance before its pixels."""
-    lazy = image.isel(y=slice(2), x=slice(2)).chunk({"x": 1})
-    mapped = fit_pixels(lazy, method="laplace", scene="picture", shared=())
-    (caution,) = pb.maps.perfect_cautions(mapped)
-    assert "perfectly known: polarization_loss, tone_curve" in caution
-    assert not pb.maps.perfect_cautions(fit_pixels(lazy, **ASKED, shared=()))

@@ -185,7 +185,7 @@ def test_each_pixel_may_have_directions_of_its_own() -> None:
 def test_fitted_values_are_those_of_the_scene(scene: str, wavelengths: tuple) -> None:
     protocol = pb.simulation.Protocol(views=10, wavelengths=wavelengths)
     one = pb.simulate("plastic", scene=scene, protocol=protocol, seed=1)
-    request = resolve(one, "per_material", *[None] * 4, 0, "double", of_pixel=True)
+    request = resolve(one, "per_material", *[None] * 4, 0, "double", shared=())
     own = {n: wavelengths if n in SPECTRAL else () for n in request.priors}
     sizes = {name: (2, 3, *([len(axis)] if axis else [])) for name, axis in own.items()}
     rng = np.random.default_rng(0)
