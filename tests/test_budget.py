@@ -42,9 +42,9 @@ WHOLE = {
 
 The plan was 20,500 lines of code, 290 classes and 180 `Any`, for a package that had 23,938 lines.
 Since then features came that were chosen over it: readers of other people's files (900 lines),
-the set-up in the interval (210) and in maps (220), a map to point at (290), second bounces and passages (220),
-programs on the disk (90), exposures that are set for the light (40), and what is known better
-beside further views (70). The other rooms became smaller by a few lines only.
+the set-up in the interval (210) and in maps (220), a map to point at (290), second bounces and
+passages (220), programs on the disk (90), exposures that are set for the light (40), and what is
+known better beside further views (70). The other rooms became smaller by a few lines only.
 """
 
 
