@@ -18,7 +18,7 @@ from polar_bayes.observation.links import AbstractLink, noise_parameters
 from polar_bayes.physics.part import UNPOLARIZED, at_least
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 from polar_bayes.physics.stokes import Light
-from polar_bayes.priors import CONTRAST, MIDDLE_GRAY, Metered
+from polar_bayes.priors import CONTRAST, Metered
 
 Priors = Mapping[str, dist.Distribution]
 Links = Mapping[str, AbstractLink]
@@ -165,9 +165,7 @@ def declare_readings(
     # Readings without noise (eq. 1), and the likelihood.
     light = scene.arriving(parameters, data.geometry)
     noise = {name: _draw_noise(name, priors, light, data) for name in noise_parameters(links)}
-    # A set-up without a stated exposure is metered for its light; a prior may say otherwise.
-    metered = {"exposure": MIDDLE_GRAY * jnp.exp(-_log_average(light, data))}
-    prediction = scene.record(metered | parameters | noise, data.geometry, light)
+    prediction = scene.record(parameters | noise, data.geometry, light)
     with over_axes(data):
         for name, link in links.items():
             numpyro.deterministic(f"{name}_mean", link.center(name, prediction, noise))

@@ -272,10 +272,6 @@ CONTRAST = 1e4
 bare mirror is darker, and nobody exposes for that."""
 
 
-MIDDLE_GRAY = 0.18
-"""Share of full scale at which a meter has the log-average of the light."""
-
-
 class Metered(dist.LogNormal):
     """Log-normal prior of an exposure that was set by a meter for the light of the capture.
 
@@ -566,7 +562,7 @@ _ROWS: dict[str, dist.Distribution] = {
     "stokes_error_factor": dist.LogNormal(math.log(1.5), 0.7),
     # Bodies under unit irradiance come near full scale at exposures of 5 to 15.
     "exposure": Metered(math.log(7.0), 3.0),
-    "exposure_share": dist.LogNormal(math.log(MIDDLE_GRAY), 2.0),
+    "exposure_share": dist.LogNormal(math.log(0.18), 2.0),
     "intensity_scale": dist.LogNormal(math.log(0.02), 1.0),
 }
 

@@ -26,7 +26,7 @@ CODE = {
     "reporting": 3272,
     "scenes": 1772,
     "own files": 1595,
-    "models": 333,
+    "models": 332,
     "tests": 23157,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""

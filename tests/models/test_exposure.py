@@ -12,11 +12,8 @@ from numpyro import handlers
 from scipy import stats
 
 import polar_bayes as pb
-from polar_bayes.capture.schema import validate
 from polar_bayes.models.per_material import per_material
-from polar_bayes.observation.data import observe
 from polar_bayes.physics.geometry import Geometry
-from polar_bayes.physics.input_quantities import AmbientLight
 from polar_bayes.priors import CONTRAST
 from polar_bayes.setups import SETUPS
 from polar_bayes.simulation import Protocol
@@ -110,23 +107,3 @@ def test_a_black_scene_has_a_finite_exposure(capture: xr.Dataset) -> None:
         fit = pb.fit(black, scene="paper", method="laplace", precision=precision)
         for group in ("prior", "posterior"):
             assert np.isfinite(fit[group]["exposure"].to_numpy()).all()
-
-
-def test_a_table_without_brightness_is_metered_for_its_light() -> None:
-    """Ambient light is a share of what a meter lets be recorded, not of a glossy highlight."""
-    scene = SCENE.known_to((AmbientLight(),))
-    glossy = {"roughness": 0.05, "subsurface_fraction": 0.02, "ambient_light_offset": 0.01}
-    angles = VIEWS.angles()
-    table = pb.simulate("plastic", scene=SCENE, protocol=VIEWS, seed=1)[["dop", *angles]]
-    links = {"dop": pb.links.BetaLink()}
-    with jax.enable_x64(True):
-        data = observe(validate(table), largest_view_zenith=90.0, described=links)
-        held = handlers.substitute(handlers.seed(per_material, 0), data=glossy)
-        trace = handlers.trace(held).get_trace(data, scene=scene, priors=pb.PRIORS, links=links)
-        drawn = {n: trace[n]["value"] for n in SCENE.parameters}
-        light = SCENE.predict(drawn, Geometry.from_degrees(**angles))
-    seen, dop = np.asarray(light["intensity"]), np.asarray(light["dop"])
-    full_scale = np.exp(np.log(seen + seen.max() / CONTRAST).mean()) / 0.18
-    assert full_scale < 0.1 * seen.max()
-    expected = dop * seen / (seen + 0.01 * full_scale)
-    np.testing.assert_allclose(trace["dop_mean"]["value"].ravel(), expected, rtol=1e-6)
