@@ -154,13 +154,15 @@ def image_with_errors(name: str, side: int, seed: int, *, of_pixels: bool) -> xr
         for name, key in drawn
     }
     protocol = pb.simulation.Protocol(views=12, wavelengths=(), largest_view_zenith=75.0)
+    if name == "picture":
+        protocol = pb.simulation.MirrorScan(views=8, wavelengths=(), largest_view_zenith=70.0)
     asked = {"scene": scene, "links": setup.links, "protocol": protocol, "parameters": truth}
     return pb.simulate("plastic", **asked, seed=seed)
 
 
 def setup() -> None:
     """Print the coverage of intervals in set-ups with errors."""
-    for name in ("camera", "polarimeter"):
+    for name in ("camera", "polarimeter", "picture"):
         usual = pb.setups.SETUPS[name]
         image = image_with_errors(name, CAMERA_SIDE, 3, of_pixels=True)
         for title, asked in (
@@ -172,9 +174,8 @@ def setup() -> None:
             print(f"{name}, {title}: {time.perf_counter() - begun:.0f} s with compilation")
             print(pb.maps.count_pixels(maps), pb.maps.setup_sentences(maps))
             print(pb.diagnostics.map_coverage(maps, image)[["answered", "held_95"]].round(3))
-    lamp = ("dolp_gain", "light_zenith_offset", "light_azimuth_offset")
     one_setup("by default", None)
-    one_setup("lamp shared", lamp)
+    one_setup("zenith of the lamp shared", ("dolp_gain", "light_zenith_offset"))
 
 
 def one_setup(title: str, shared: tuple[str, ...] | None) -> None:

@@ -122,6 +122,7 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
             # A fraction of .009 dilutes the polarization of a mirror by a fifth already.
             priors=MAYBE_BARE,
             known=(AnalyzerRoll(), PolarizationLoss(), ToneCurve()),
+            sampled=("polarization_loss",),  # of a bare mirror, it looks like a little body
         ),
         # A laser beam grows longer than the sample towards grazing, each channel losing its own
         # share: beyond 78 degrees a plate's readings say more about its size than its index.

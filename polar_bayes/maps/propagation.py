@@ -149,7 +149,7 @@ class Propagation:
         moved = batch.run(_moves, None, z, response.astype(dtype), given=(errors,))
         scores = np.broadcast_to(errors.T[:, None], (len(self.names), len(batch), DRAWS))
         every = moved | dict(zip(self.names, scores, strict=True))
-        return {name: np.asarray(x)[:, :count] for name, x in every.items()}
+        return {name: np.asarray(x, np.float32)[:, :count] for name, x in every.items()}
 
     def _search(self, batch: ProblemBatch, found: BatchDraws) -> tuple[AnyArray, AnyArray]:
         """Search for modes from the heaviest draws, where the method tells none."""

@@ -7,7 +7,7 @@ $$ \frac{1}{N^2} \sum_i \left(\sigma_i^2 - \sum_k b_{ik}^2\right) + \sum_k \bar 
 """
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -20,8 +20,12 @@ from scipy.special import ndtri
 from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.importers.detector import read_image
 from polar_bayes.inference.batching import IMAGE, Status, cut
-from polar_bayes.inference.result import CENTRAL_95
+from polar_bayes.inference.result import CENTRAL_95, provenance_of
 from polar_bayes.maps.lazy import CHUNK, checked_status, map_parameters
+
+MOST_OF_SETUP = 0.5
+"""Share of one error of the set-up in the variance of a mean above which its effect must be more
+than first order."""
 
 
 class _Sums(NamedTuple):
@@ -100,10 +104,12 @@ def region_means(
     }
     shown = np.delete(np.arange(found.size), [] if reference is None else reference)
     cautions: list[str] = []
+    shares: dict[str, float] = {}
     for name, total in sums.items():
         means = _of_regions(total, counts[0], reference)
         sd = means.sd
         cautions += _cautions(name, found, means, shown)
+        shares |= _error_shares(maps, means, shown, shares)
         interval = means.mean + ndtri(CENTRAL_95).reshape(-1, *[1] * sd.ndim) * sd
         attrs = {key: maps[name].attrs.get(key, "") for key in ("units", "symbol")}
         axes = ("region", *_own_dims(maps, name))
@@ -112,6 +118,7 @@ def region_means(
         variables[f"{name}_interval"] = (("bound", *axes), interval, attrs)
         pull = np.where(means.is_pull_known, means.pull, np.nan)
         variables[f"{name}_prior_pull"] = (axes, pull, attrs)
+    cautions += _caution_of_errors(shares)
     own = {dim: x for dim, x in maps.coords.items() if any(dim in v[0] for v in variables.values())}
     answer = xr.Dataset(variables, {**own, "region": found, "bound": list(CENTRAL_95)})
     return answer.isel(region=shown).assign_attrs(cautions=cautions)
@@ -244,6 +251,29 @@ def _of_regions(sums: _Sums, count: np.ndarray, reference: int | None) -> _Sums:
         slope = slope - slope[:, reference, None]
         variance, spread = variance + variance[reference], spread + spread[reference]
     return _Sums(mean, variance, slope, pull, spread)
+
+
+def _error_shares(
+    maps: xr.Dataset, found: _Sums, shown: np.ndarray, known: Mapping[str, float]
+) -> dict[str, float]:
+    """Return the largest share of each error of the set-up in the variance of a region's mean."""
+    names = [str(name) for name in maps["shared"].to_numpy()] if "shared" in maps.dims else []
+    carried = provenance_of(maps).get("carried") or {}
+    with np.errstate(divide="ignore", invalid="ignore"):  # regions without an answer are NaN
+        shares = (found.slope**2 / found.sd**2)[:, shown]
+    every = zip(names, shares, strict=True)
+    return {n: np.fmax(known.get(n, 0.0), np.nanmax(x)) for n, x in every if n in carried}
+
+
+def _caution_of_errors(shares: Mapping[str, float]) -> Iterator[str]:
+    """Caution against means that are no better than the set-up, to first order."""
+    worst = max(shares, key=lambda name: shares[name], default="")
+    if worst and shares[worst] > MOST_OF_SETUP:
+        yield (
+            f"{worst}: this error of the set-up makes up to {shares[worst]:.0%} of the variance of "
+            "these means, and a map has it to first order only. Let the pixels determine it, by "
+            f"shared=({worst!r},), or measure it."
+        )
 
 
 def _cautions(name: str, labels: np.ndarray, found: _Sums, shown: np.ndarray) -> Iterator[str]:
