@@ -54,8 +54,8 @@ def budget(
         A row for each scalar parameter of the material, in its unit: the posterior's standard
         deviation `sd`; `perfect`, what it would be in a set-up known perfectly; and what
         contributes to `sd`, in squares: the `noise`, the `prior`, the `model discrepancy` where the
-        scene has one, and each input quantity, which has a sign. Columns such as `light_zenith
-        halved` have what `sd` would be if that quantity alone were known twice as well. The
+        scene has one, and each input quantity, which has a sign. Columns that end in
+        `halved` have what `sd` would be if that quantity alone were known twice as well. The
         attribute `known` has the standard uncertainties of the quantities.
 
     Raises:

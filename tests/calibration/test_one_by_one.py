@@ -179,10 +179,12 @@ def test_chains_of_any_length_have_their_parameters(capture: xr.Dataset) -> None
 def test_draws_are_thinned_by_what_they_are_worth() -> None:
     draws = {"x": np.arange(200.0).reshape(2, 100), "y": np.zeros((2, 100, 3))}
     draws["x"][0, 40] = np.nan
-    few = thin_draws(draws, effective=21.0)  # every tenth: 200 / 21, rounded up
+    z = np.arange(400.0).reshape(2, 100, 2)
+    kept, few = thin_draws(z, draws, effective=21.0)  # every tenth: 200 / 21, rounded up
+    assert kept[:, 0].tolist() == [2.0 * x for x in few["x"]]
     assert few["x"].tolist() == [x for x in range(0, 200, 10) if x != 40]
     assert few["y"].shape == (19, 3)
-    assert len(thin_draws(draws, effective=500.0)["x"]) == 199
+    assert len(thin_draws(z, draws, effective=500.0)[0]) == 199
 
 
 @dataclasses.dataclass(frozen=True)
