@@ -7,7 +7,7 @@ $$ \frac{1}{N^2} \sum_i \left(\sigma_i^2 - \sum_k b_{ik}^2\right) + \sum_k \bar 
 """
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +24,7 @@ from polar_bayes.inference.result import CENTRAL_95, provenance_of
 from polar_bayes.maps.lazy import CHUNK, checked_status, map_parameters
 
 MOST_OF_SETUP = 0.5
-"""Share of one error of the set-up in the variance of a mean above which its effect must be more
-than first order."""
+"""Share of errors of the set-up in the variance of a mean above which first order may not do."""
 
 
 class _Sums(NamedTuple):
@@ -104,12 +103,12 @@ def region_means(
     }
     shown = np.delete(np.arange(found.size), [] if reference is None else reference)
     cautions: list[str] = []
-    shares: dict[str, float] = {}
+    worst = 0.0, ""
     for name, total in sums.items():
         means = _of_regions(total, counts[0], reference)
         sd = means.sd
         cautions += _cautions(name, found, means, shown)
-        shares |= _error_shares(maps, means, shown, shares)
+        worst = max(worst, _error_share(maps, means, shown))
         interval = means.mean + ndtri(CENTRAL_95).reshape(-1, *[1] * sd.ndim) * sd
         attrs = {key: maps[name].attrs.get(key, "") for key in ("units", "symbol")}
         axes = ("region", *_own_dims(maps, name))
@@ -118,7 +117,13 @@ def region_means(
         variables[f"{name}_interval"] = (("bound", *axes), interval, attrs)
         pull = np.where(means.is_pull_known, means.pull, np.nan)
         variables[f"{name}_prior_pull"] = (axes, pull, attrs)
-    cautions += _caution_of_errors(shares)
+    share, error = worst
+    if share > MOST_OF_SETUP:
+        cautions.append(
+            f"Errors of the set-up make up to {share:.0%} of the variance of these means, most by "
+            f"{error}, and a map has them to first order only. Let the pixels determine that one, "
+            f"by shared=({error!r},), or measure it."
+        )
     own = {dim: x for dim, x in maps.coords.items() if any(dim in v[0] for v in variables.values())}
     answer = xr.Dataset(variables, {**own, "region": found, "bound": list(CENTRAL_95)})
     return answer.isel(region=shown).assign_attrs(cautions=cautions)
@@ -253,27 +258,18 @@ def _of_regions(sums: _Sums, count: np.ndarray, reference: int | None) -> _Sums:
     return _Sums(mean, variance, slope, pull, spread)
 
 
-def _error_shares(
-    maps: xr.Dataset, found: _Sums, shown: np.ndarray, known: Mapping[str, float]
-) -> dict[str, float]:
-    """Return the largest share of each error of the set-up in the variance of a region's mean."""
-    names = [str(name) for name in maps["shared"].to_numpy()] if "shared" in maps.dims else []
+def _error_share(maps: xr.Dataset, found: _Sums, shown: np.ndarray) -> tuple[float, str]:
+    """Return the largest share of the set-up in the variance of a mean, and its largest error."""
     carried = provenance_of(maps).get("carried") or {}
+    if not carried:
+        return 0.0, ""
+    names = maps["shared"].to_numpy()
+    is_error = np.isin(names, list(carried))
     with np.errstate(divide="ignore", invalid="ignore"):  # regions without an answer are NaN
-        shares = (found.slope**2 / found.sd**2)[:, shown]
-    every = zip(names, shares, strict=True)
-    return {n: np.fmax(known.get(n, 0.0), np.nanmax(x)) for n, x in every if n in carried}
-
-
-def _caution_of_errors(shares: Mapping[str, float]) -> Iterator[str]:
-    """Caution against means that are no better than the set-up, to first order."""
-    worst = max(shares, key=lambda name: shares[name], default="")
-    if worst and shares[worst] > MOST_OF_SETUP:
-        yield (
-            f"{worst}: this error of the set-up makes up to {shares[worst]:.0%} of the variance of "
-            "these means, and a map has it to first order only. Let the pixels determine it, by "
-            f"shared=({worst!r},), or measure it."
-        )
+        shares = (found.slope[is_error] ** 2 / found.sd**2)[:, shown]
+    shares = np.nan_to_num(shares.reshape(len(shares), -1))
+    at = np.argmax(shares.sum(axis=0))
+    return float(shares[:, at].sum()), str(names[is_error][np.argmax(shares[:, at])])
 
 
 def _cautions(name: str, labels: np.ndarray, found: _Sums, shown: np.ndarray) -> Iterator[str]:
