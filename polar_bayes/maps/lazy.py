@@ -396,12 +396,12 @@ def setup_sentences(maps: xr.Dataset) -> list[str]:
     if shares.empty:
         return []
     parts = [
-        f"{row.sum():.0%} of {name} (most by {row.idxmax().removesuffix('_offset')})"
+        f"{row.sum():.0%} of that of {name} (most by {row.idxmax().removesuffix('_offset')})"
         for name, row in shares.iterrows()
     ]
     return [
-        "Intervals hold errors of the set-up, which are the same in all pixels: of the variance of "
-        f"pixels they make {', '.join(parts)}."
+        "Intervals include errors of the set-up, which are the same in all pixels. They make up a "
+        f"part of the variance of pixels: {', '.join(parts)}."
     ]
 
 

@@ -174,7 +174,7 @@ def test_the_command_takes_standard_uncertainties(
     image.assign_attrs(setup="camera").to_netcdf(tmp_path / "image.nc")
     asked = ["map", str(tmp_path / "image.nc"), "--out", str(tmp_path / "map.zarr")]
     assert main([*asked, "--method", "laplace", "--known", "light_zenith=0.2"]) == 0
-    assert "Intervals hold errors of the set-up" in capsys.readouterr().out
+    assert "Intervals include errors of the set-up" in capsys.readouterr().out
     maps = pb.maps.open_map(tmp_path / "map.zarr")
     assert provenance_of(maps)["carried"]["light_zenith_offset"] == 0.2
     assert main([*asked, "--method", "laplace", "--resume"]) != 0
