@@ -7,6 +7,7 @@ from pathlib import Path
 
 import jax
 
+from polar_bayes.numerics.compile import LRUCache
 from polar_bayes.scenes.fit_request import fit_request
 
 
@@ -14,6 +15,10 @@ def fit_alone(patch) -> None:
     """Let fits do without those of other scenes, which compile programs of their own."""
     alone = functools.partial(fit_request, with_comparisons=False)
     patch.setattr("polar_bayes.scenes.fitting.fit_request", alone)
+
+
+FAST: LRUCache = LRUCache(16)
+"""Models that were compiled fast."""
 
 
 def drop_programs() -> None:
@@ -49,6 +54,8 @@ def compiled_fast(monkeypatch, *, starts, typical, draws, block):
     }
     for name, number in numbers.items():
         monkeypatch.setattr(f"polar_bayes.{name}", number)
+    # Other tests of this process must not meet what was compiled and searched in haste.
+    monkeypatch.setattr("polar_bayes.inference.compiled_model._COMPILED", FAST)
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)

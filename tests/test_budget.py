@@ -18,7 +18,7 @@ CODE = {
     "diagnostics": 1877,
     "importers": 2102,
     "inference": 2769,
-    "maps": 1907,
+    "maps": 1909,
     "methods": 1280,
     "numerics": 1006,
     "observation": 515,
@@ -27,12 +27,12 @@ CODE = {
     "scenes": 1772,
     "own files": 1595,
     "models": 332,
-    "tests": 23167,
+    "tests": 23169,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 26052,
+    "code": 26054,
     "classes": 336,
     "constants": 426,
     "Any": 178,

@@ -73,7 +73,7 @@ class Request(ModelParts):
     """Parameters of the set-up that the pixels of an image share by default."""
     carried: Mapping[str, dist.Distribution]
     """Priors of input quantities that a pixel does not sample: they move all pixels alike."""
-    with_setup: Scene
+    scene_with_setup: Scene
     """The scene with those quantities."""
 
     def standard_uncertainties(self, sampled: Container[str]) -> dict[str, float]:
@@ -166,7 +166,7 @@ def resolve(
             {n: prior for n, prior in stated.items() if n in found.priors or n in given},
         ),
         carried={n: {**PRIORS, **every}[n] for n in whole.scene.parameters if n in carried},
-        with_setup=whole.scene,
+        scene_with_setup=whole.scene,
         declared=found.declared,
         fixed=found.fixed,
         links=chosen,

@@ -169,7 +169,7 @@ class MapPlan:
     def sharing(self, names: Sequence[str]) -> "MapPlan":
         """Return the request with these parameters shared by all pixels."""
         own, no_unit = sorted(self.own_directions), self.intensity_unit is None
-        setup = repr(self.request.with_setup) if self.carried else ""
+        setup = repr(self.request.scene_with_setup) if self.carried else ""
         key = layout_key(self.request, own, no_unit, tuple(names), setup)
         shared = tuple(of_priors(names, self.request.priors))
         return dataclasses.replace(self, key=key, shared=shared)
@@ -208,7 +208,9 @@ class MapPlan:
         # Each has a normal prior: the coordinate of what only adds has no value at zero.
         normal = {name: dist.Normal(0.0, 1.0) for name in self.request.carried}
         priors = {**self.request.priors, **normal}
-        asked = dataclasses.replace(self.request, scene=self.request.with_setup, priors=priors)
+        asked = dataclasses.replace(
+            self.request, scene=self.request.scene_with_setup, priors=priors
+        )
         return compile_layout(f"{self.key} with its set-up", asked, self._pixel)
 
     @property
