@@ -18,7 +18,7 @@ CODE = {
     "diagnostics": 1877,
     "importers": 2102,
     "inference": 2769,
-    "maps": 1909,
+    "maps": 1910,
     "methods": 1280,
     "numerics": 1006,
     "observation": 515,
@@ -32,7 +32,7 @@ CODE = {
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 26054,
+    "code": 26055,
     "classes": 336,
     "constants": 426,
     "Any": 178,

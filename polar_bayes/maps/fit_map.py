@@ -286,7 +286,8 @@ def estimate_plan(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
 def _check_shared(names: Sequence[str], request: Request) -> None:
     """Refuse shared parameters that are vectors, unknown, or part of the material."""
     for name in names:
-        known = [each for each in request.priors if each not in MATERIAL_PARAMETERS]
+        every = *request.priors, *request.carried
+        known = [each for each in every if each not in MATERIAL_PARAMETERS]
         if name not in known or request.priors[name].event_shape:
             what, hint = "an image cannot share it", f"give names among {', '.join(known)}"
             raise FitError(what, where=f"fit_pixels: shared={name!r}", hint=hint)
