@@ -190,9 +190,10 @@ def one_setup(title: str, shared: tuple[str, ...] | None) -> None:
         names = [name for name in MATERIAL_PARAMETERS if name in means]
         apart = {n: float(means[n]) - image[f"true_{n}"].to_numpy()[good].mean() for n in names}
         scores.append({n: apart[n] / float(means[f"{n}_sd"]) for n in names})
-        rows = pb.maps.shared_parameters(maps).iterrows()
-        true = ((row, float(image[f"true_{name}"])) for name, row in rows)
-        gains.append([row["q2.5"] <= x <= row["q97.5"] for row, x in true])
+        rows = pb.maps.shared_parameters(maps)
+        rows["true"] = [float(image[f"true_{name}"]) for name in rows.index]
+        gains.append(rows["true"].between(rows["q2.5"], rows["q97.5"]).to_dict())
+        print(f"seed {100 + seed}", rows.round(3), sep="\n")
     print(f"one set-up, {title}: pixels held", pd.DataFrame(held).mean().round(3).to_dict())
     print("means of all pixels, in standard deviations of their intervals")
     print(pd.DataFrame(scores).round(2))

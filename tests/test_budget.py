@@ -18,7 +18,7 @@ CODE = {
     "diagnostics": 1877,
     "importers": 2102,
     "inference": 2769,
-    "maps": 1910,
+    "maps": 1911,
     "methods": 1280,
     "numerics": 1006,
     "observation": 515,

@@ -223,10 +223,9 @@ def map_(
     for name, row in pb.maps.shared_parameters(maps).iterrows():
         interval = f"{row['q50']:.5g} [{row['q2.5']:.5g}, {row['q97.5']:.5g}]"
         click.echo(f"{name}: {interval} in all pixels, from {row['pixels']:.0f} of them")
-    sentences = pb.maps.criticism_sentences, pb.maps.start_sentences, pb.maps.setup_sentences
-    for of_maps in sentences:
-        for sentence in of_maps(maps):
-            say(sentence)
+    sentences = [*pb.maps.criticism_sentences(maps), *pb.maps.start_sentences(maps)]
+    for sentence in (*sentences, *pb.maps.setup_sentences(maps)):
+        say(sentence)
     print_cautions(pb.maps.shared_cautions(maps))
 
 

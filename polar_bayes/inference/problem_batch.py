@@ -121,8 +121,8 @@ class BatchDraws(NamedTuple):
     """Results of a method for some captures of a batch: one row each, or one value for all.
 
     `mode` is a mode of each capture and a root of the covariance there; `draws` is empty where
-    there is no answer, and `z` holds the unconstrained vectors of the draws. What is found later
-    for a capture replaces what was found before.
+    there is no answer, and `z` computes the unconstrained vectors of the draws, which few callers
+    need. What is found later for a capture replaces what was found before.
     """
 
     at: np.ndarray
@@ -135,7 +135,7 @@ class BatchDraws(NamedTuple):
     condition: AnyArray | float = np.nan
     steps: np.ndarray | int = 0
     mode: tuple[AnyArray, AnyArray] | None = None
-    z: AnyArray = np.empty((0, 0, 0))
+    z: Callable[[], AnyArray] = lambda: np.empty((0, 0, 0))
 
 
 class Outcome:

@@ -183,11 +183,11 @@ def _known_to(
 ) -> tuple[Setup, Setup]:
     """The set-up with input quantities that a fit, or a pixel, samples, and with all of them."""
     acting = [each for each in setup.known if all(name in capture for name in each.needs)]
-    of_pixel = acting
+    sampled = acting
     if shared is not None:
-        names = {*shared, *(f"{name}_offset" for name in setup.sampled)}
-        of_pixel = [each for each in acting if names & set(each.parameters)]
-    some, every = (setup.scene.known_to(each) for each in (of_pixel, acting))
+        own = {*setup.sampled, *shared}
+        sampled = [each for each in acting if own & {each.name, *each.parameters}]
+    some, every = (setup.scene.known_to(each) for each in (sampled, acting))
     return dataclasses.replace(setup, scene=some), dataclasses.replace(setup, scene=every)
 
 

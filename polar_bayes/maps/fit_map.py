@@ -168,11 +168,12 @@ class MapPlan:
 
     def sharing(self, names: Sequence[str]) -> "MapPlan":
         """Return the request with these parameters shared by all pixels."""
-        own, no_unit = sorted(self.own_directions), self.intensity_unit is None
-        setup = repr(self.request.scene_with_setup) if self.carried else ""
-        key = layout_key(self.request, own, no_unit, tuple(names), setup)
         shared = tuple(of_priors(names, self.request.priors))
-        return dataclasses.replace(self, key=key, shared=shared)
+        return dataclasses.replace(self, key=self._key(self.request, names), shared=shared)
+
+    def _key(self, request: Request, shared: Sequence[str]) -> str:
+        own, no_unit = sorted(self.own_directions), self.intensity_unit is None
+        return layout_key(request, own, no_unit, tuple(shared))
 
     def observe(self, capture: xr.Dataset) -> Observations:
         """Return a block, or one pixel, as arrays."""
@@ -211,7 +212,8 @@ class MapPlan:
         asked = dataclasses.replace(
             self.request, scene=self.request.scene_with_setup, priors=priors
         )
-        return compile_layout(f"{self.key} with its set-up", asked, self._pixel)
+        key = self._key(asked, [each.name for each in self.shared])
+        return compile_layout(key, asked, self._pixel)
 
     @property
     def engine(self) -> CompiledModel:

@@ -129,11 +129,11 @@ class Propagation:
         response[~is_known] = 0.0
         good = np.where(is_known, Status.GOOD, Status.NOT_TRUSTED)
         status = np.where(np.asarray(found.status) == Status.GOOD, good, found.status)
-        count = found.weights.shape[1]
+        z = found.z()
         parts = [
-            self._moved(batch, found.z[:, begin : begin + DRAWS], sign, response)
+            self._moved(batch, z[:, begin : begin + DRAWS], sign, response)
             for sign in (1.0, -1.0)
-            for begin in range(0, count, DRAWS)
+            for begin in range(0, z.shape[1], DRAWS)
         ]
         draws = {name: np.concatenate([part[name] for part in parts], 1) for name in parts[0]}
         weights = np.tile(0.5 * found.weights, 2)
@@ -154,7 +154,7 @@ class Propagation:
     def _search(self, batch: ProblemBatch, found: BatchDraws) -> tuple[AnyArray, AnyArray]:
         """Search for modes from the heaviest draws, where the method tells none."""
         heaviest = np.argmax(found.weights, axis=1)
-        start = np.asarray(found.z, batch.engine.dtype)[np.arange(len(batch)), heaviest]
+        start = np.asarray(found.z(), batch.engine.dtype)[np.arange(len(batch)), heaviest]
         search = find_modes_from(batch, start)
         root = np.where(search.converged[:, None, None], search.mode.root, np.nan)
         return search.mode.z, root

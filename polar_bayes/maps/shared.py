@@ -324,7 +324,7 @@ def _expectations(
             ends[found.at] = found.mode[0]
         if found.at.size and found.draws:
             rows, which = np.arange(found.at.size)[:, None], _resampled(found.weights)
-            every[found.at] = np.asarray(found.z)[rows, which]
+            every[found.at] = found.z()[rows, which]
     good = np.flatnonzero(outcome.status == Status.GOOD)
     names = tuple(each.name for each in shared)
     if not good.size:

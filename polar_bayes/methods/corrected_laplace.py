@@ -7,6 +7,7 @@ draws of a sampler (`Importance`, say), which also fits pixels whose mode was no
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Generator, Iterator
 from typing import ClassVar, NamedTuple, Self, override
@@ -265,7 +266,7 @@ class _Run:
             mode.condition,
             found.search.steps,
             (mode.z, mode.root),
-            proposal.draws(self.points),
+            functools.partial(proposal.draws, self.points),
         )
 
     def adapt(
@@ -292,7 +293,7 @@ class _Run:
                 enough[enough] = ~self._has_arm(some[enough], take_rows(proposal, enough))
             answers = take_rows((parameters, weights, effective), enough)
             at, mode = self.at[some[enough]], take_rows(normal.search.mode, left[enough])
-            z = take_rows(proposal, enough).draws(points)
+            z = functools.partial(take_rows(proposal, enough).draws, points)
             yield BatchDraws(
                 at, Status.GOOD, *answers, MethodUsed.ADAPTED, mode=(mode.z, mode.root), z=z
             )

@@ -280,7 +280,7 @@ class Rounds:
             MethodUsed.IMPORTANCE,
             self.pareto_k,
             mode=mode,
-            z=self.z[None],
+            z=lambda: self.z[None],
         )
 
     def _fit(self, log_ratios: np.ndarray) -> Mixture:

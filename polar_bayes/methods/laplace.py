@@ -91,7 +91,7 @@ class Laplace(AbstractMethod):
             MethodUsed.LAPLACE,
             condition=np.asarray(modes.condition),
             mode=mode,
-            z=z,
+            z=lambda: z,
         )
 
 

@@ -295,7 +295,7 @@ class AbstractMethod(AbstractBatchMethod):
                 effective,
                 method,
                 draws.pareto_k,
-                z=z[None],
+                z=lambda: z[None],
             )
 
         yield from (found for found in _THREADS.map(run, range(len(batch))) if found is not None)
