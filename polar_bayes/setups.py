@@ -104,7 +104,9 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
         "camera": Setup(
             SCENES["camera"],
             {"q": StokesLink(), "u": StokesLink(), "intensity": StudentTLink()},
-            shared=("dolp_gain",),  # one polarizer took the image
+            # One polarizer took the image, by one lamp, whose direction moves the means of many
+            # pixels further than they are known to.
+            shared=("dolp_gain", "light_zenith_offset"),
             known=(  # the gain of polarization is in `dolp_gain`
                 LightZenith(),
                 LightAzimuth(),

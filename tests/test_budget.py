@@ -18,7 +18,7 @@ CODE = {
     "diagnostics": 1877,
     "importers": 2102,
     "inference": 2769,
-    "maps": 1911,
+    "maps": 1922,
     "methods": 1280,
     "numerics": 1006,
     "observation": 515,
@@ -27,12 +27,12 @@ CODE = {
     "scenes": 1772,
     "own files": 1595,
     "models": 332,
-    "tests": 23169,
+    "tests": 23202,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 26055,
+    "code": 26066,
     "classes": 336,
     "constants": 426,
     "Any": 178,
@@ -42,7 +42,7 @@ WHOLE = {
 
 The plan was 20,500 lines of code, 290 classes and 180 `Any`, for a package that had 23,938 lines.
 Since then features came that were chosen over it: readers of other people's files (900 lines),
-the set-up in the interval (210) and in maps (240), a map to point at (290), second bounces and
+the set-up in the interval (210) and in maps (250), a map to point at (290), second bounces and
 passages (220), programs on the disk (90), exposures that are set for the light (40), and what is
 known better beside further views (70). The other rooms became smaller by a few lines only.
 """

@@ -70,7 +70,7 @@ class Request(ModelParts):
     seed: int
     precision: str
     shared: tuple[str, ...]
-    """Parameters of the set-up that the pixels of an image share by default."""
+    """Parameters of the set-up that the pixels of an image share by default, carried or not."""
     carried: Mapping[str, dist.Distribution]
     """Priors of input quantities that a pixel does not sample: they move all pixels alike."""
     scene_with_setup: Scene
@@ -174,7 +174,7 @@ def resolve(
         largest_view_zenith=limit,
         seed=int(seed),
         precision=precision,
-        shared=tuple(name for name in setup.shared if name in found.priors),
+        shared=tuple(n for n in setup.shared if n in found.priors or n in carried),
     )
 
 

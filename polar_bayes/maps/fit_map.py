@@ -164,12 +164,18 @@ class MapPlan:
     shared: tuple[SharedParameter, ...] = ()
     carried: tuple[Carried, ...] = ()
     shares_by_default: bool = dataclasses.field(default=False, compare=False)
+    otherwise: "MapPlan | None" = dataclasses.field(default=None, compare=False)
+    """What holds where pixels do not agree about what they share by default."""
     found: Mapping[str, object] = dataclasses.field(default_factory=dict, compare=False)
 
-    def sharing(self, names: Sequence[str]) -> "MapPlan":
-        """Return the request with these parameters shared by all pixels."""
-        shared = tuple(of_priors(names, self.request.priors))
-        return dataclasses.replace(self, key=self._key(self.request, names), shared=shared)
+    def sharing(self, names: Sequence[str], request: Request) -> "MapPlan":
+        """Return the plan of a request in which these parameters are shared by all pixels."""
+        key, shared = self._key(request, names), tuple(of_priors(names, request.priors))
+        plan = dataclasses.replace(self, key=key, request=request, shared=shared)
+        # A model of the user's own need not know of them.
+        sites = plan.with_setup.program.positions if request.carried else {}
+        acting = tuple(each for each in carried(request.carried) if each.name in sites)
+        return dataclasses.replace(plan, carried=acting)
 
     def _key(self, request: Request, shared: Sequence[str]) -> str:
         own, no_unit = sorted(self.own_directions), self.intensity_unit is None
@@ -263,18 +269,19 @@ def plan_map(
     request = resolve(*asked, known=known, shared=names)
     _check_shared(names, request)
     stated = (name for name in (*ANGLES, "normal_confidence") if name in capture)
-    own = frozenset(name for name in stated if set(IMAGE) & set(capture[name].dims))
-    unit, quantities, is_usual = _intensity_unit(capture), carried(request.carried), shared is None
-    plan = MapPlan("", request, settings, unit, own, carried=quantities, shares_by_default=is_usual)
+    of_pixels = frozenset(name for name in stated if set(IMAGE) & set(capture[name].dims))
+    unit, is_usual = _intensity_unit(capture), shared is None
+    plan = MapPlan("", request, settings, unit, of_pixels, shares_by_default=is_usual)
+    plan = plan.sharing(names, request)
     is_large = capture.sizes["y"] * capture.sizes["x"] >= SHARED_PIXELS
-    if is_usual and is_large:
-        names = request.shared
-    plan = plan.sharing(names)
-    # A model of the user's own need not know of them.
-    sites = plan.with_setup.program.positions if quantities else {}
-    return dataclasses.replace(
-        plan, carried=tuple(each for each in quantities if each.name in sites)
-    )
+    quantities = [each.name for each in plan.carried]
+    # Parts of the instrument first, about which pixels agree more often than about the set-up.
+    for own in (request.priors, quantities) if is_usual and is_large else ():
+        if more := [name for name in request.shared if name in own]:
+            names = *names, *more
+            wider = plan.sharing(names, resolve(*asked, known=known, shared=names))
+            plan = dataclasses.replace(wider, otherwise=plan)
+    return plan
 
 
 def estimate_plan(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
@@ -282,7 +289,9 @@ def estimate_plan(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
 
     It takes as long as hundreds of fits, and must be done once for one image.
     """
-    return _with_settings(_with_shared(plan, capture) if plan.shared else plan, capture)
+    if plan.shared:
+        plan = _with_shared(plan, _random_pixels(capture, plan.request.seed, SHARED_PIXELS))
+    return dataclasses.replace(_with_settings(plan, capture), otherwise=None)
 
 
 def _check_shared(names: Sequence[str], request: Request) -> None:
@@ -295,33 +304,34 @@ def _check_shared(names: Sequence[str], request: Request) -> None:
             raise FitError(what, where=f"fit_pixels: shared={name!r}", hint=hint)
 
 
-def _with_shared(plan: MapPlan, capture: xr.Dataset) -> MapPlan:
+def _with_shared(plan: MapPlan, pixels: xr.Dataset) -> MapPlan:
     """Add the posterior of shared parameters, estimated from pixels drawn at random."""
-    request, settings = plan.request, plan.settings
-    pixels = _random_pixels(capture, request.seed, SHARED_PIXELS)
-    batch = plan.batch(pixels)
-    method = settings if isinstance(settings, CorrectedLaplace) else CorrectedLaplace()
+    batch, priors = plan.batch(pixels), plan.request.priors
+    method = plan.settings if isinstance(plan.settings, CorrectedLaplace) else CorrectedLaplace()
     try:
-        found = estimate_shared(batch, method, request.priors, plan.shared)
+        found = estimate_shared(batch, method, priors, plan.shared)
     except FitError as error:
-        if not plan.shares_by_default:
+        if plan.otherwise is None:
             raise
-        return _sharing_nothing(plan, error.what)
+        return _sharing_less(plan, plan.otherwise, pixels, error.what)
     most = max(each.disagreement for each in found)
-    if plan.shares_by_default and most > DISAGREEMENT:
-        return _sharing_nothing(plan, f"pixels do not agree (information matrix test {most:.1f})")
+    if plan.otherwise and most > DISAGREEMENT:
+        reason = f"pixels do not agree (information matrix test {most:.1f})"
+        return _sharing_less(plan, plan.otherwise, pixels, reason)
     plan = dataclasses.replace(plan, shared=tuple(found))
     if not plan.carried:
         return plan
     batch = plan.batch(pixels)
-    moved = moved_by_setup(batch, method, request.priors, found, plan.propagation(batch))
+    moved = moved_by_setup(batch, method, priors, found, plan.propagation(batch))
     return dataclasses.replace(plan, shared=tuple(moved))
 
 
-def _sharing_nothing(plan: MapPlan, reason: str) -> MapPlan:
-    """Return the plan without shared parameters, with the reason."""
-    told = {"names": [each.name for each in plan.shared], "reason": reason}
-    return dataclasses.replace(plan.sharing(()), found={"not_shared": told})
+def _sharing_less(plan: MapPlan, less: MapPlan, pixels: xr.Dataset, reason: str) -> MapPlan:
+    """Return the plan that shares fewer parameters, with the reason."""
+    kept = [each.name for each in less.shared]
+    names = [name for name in plan.request.shared if name not in kept]
+    less = dataclasses.replace(less, found={"not_shared": {"names": names, "reason": reason}})
+    return _with_shared(less, pixels) if less.shared else less
 
 
 def _with_settings(plan: MapPlan, capture: xr.Dataset) -> MapPlan:

@@ -344,13 +344,15 @@ def start_sentences(maps: xr.Dataset) -> list[str]:
 
 def shared_cautions(maps: xr.Dataset) -> list[str]:
     """Caution against shared parameters on which the pixels disagree."""
-    found, own = shared_parameters(maps), provenance_of(maps).get("not_shared")
+    found, provenance = shared_parameters(maps), provenance_of(maps)
+    own, carried = provenance.get("not_shared") or {}, provenance.get("carried") or {}
     cautions = []
-    if own:
-        names = ", ".join(own["names"])
+    for name in own.get("names", ()):
+        has = "intervals contain its standard uncertainty"
+        does = has if name in carried else "each pixel has its own"
         cautions.append(
-            f"{names}: one value should serve the whole image, but {own['reason']}, so that each "
-            "pixel has its own. The scene may lack a part that the image shows."
+            f"{name}: one value should serve the whole image, but {own['reason']}, so that "
+            f"{does} instead. The scene may lack a part that the image shows."
         )
     return cautions + [
         f"{name} is shared by all pixels, and they do not agree about it (information matrix test "

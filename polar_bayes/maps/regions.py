@@ -102,8 +102,7 @@ def region_means(
         "unanswered": (("region",), counts[1]),
     }
     shown = np.delete(np.arange(found.size), [] if reference is None else reference)
-    cautions: list[str] = []
-    worst = 0.0, ""
+    cautions, worst = list[str](), (0.0, "")
     for name, total in sums.items():
         means = _of_regions(total, counts[0], reference)
         sd = means.sd
@@ -119,10 +118,11 @@ def region_means(
         variables[f"{name}_prior_pull"] = (axes, pull, attrs)
     share, error = worst
     if share > MOST_OF_SETUP:
+        together = *(provenance_of(maps).get("shared") or {}), error
         cautions.append(
             f"Errors of the set-up make up to {share:.0%} of the variance of these means, most by "
             f"{error}, and a map has them to first order only. Let the pixels determine that one, "
-            f"by shared=({error!r},), or measure it."
+            f"by shared={together!r}, or measure it."
         )
     own = {dim: x for dim, x in maps.coords.items() if any(dim in v[0] for v in variables.values())}
     answer = xr.Dataset(variables, {**own, "region": found, "bound": list(CENTRAL_95)})

@@ -257,9 +257,9 @@ def map_readings(
     asked: dict[str, Any] = dict.fromkeys(ASKED)
     try:
         asked |= {"model": "per_material", **arguments_of(maps), "method": None}
-        plan = plan_map(capture, **asked, seed=0, precision="double", shared=())
-        known = {*maps, *shared_parameters(maps).index}
-        if missing := [name for name in plan.engine.program.supports if name not in known]:
+        shared = tuple(shared_parameters(maps).index)
+        plan = plan_map(capture, **asked, seed=0, precision="double", shared=shared)
+        if missing := [n for n in plan.engine.program.supports if n not in {*maps, *shared}]:
             what, hint = f"the maps do not hold {', '.join(missing)}", "fit one pixel by itself"
             raise FitError(what, where="explore", hint=hint)
     except (FitError, SceneError) as error:  # a model of the user's own, say

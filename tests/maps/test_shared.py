@@ -5,8 +5,9 @@ import pytest
 import xarray as xr
 from compilations import compilations
 from numpyro import handlers
-from plate_images import plate_image
+from plate_images import NAMES, NOISE, VIEWS, plate_image
 from plates import LINKS, ON_PLATE, PLATE
+from textbook import plate_q
 
 import polar_bayes as pb
 from polar_bayes.inference.batching import Status
@@ -134,6 +135,39 @@ def test_pixels_keep_their_own_where_nothing_should_be_shared(tmp_path, monkeypa
     assert "one value should serve the whole image, but pixels do" in caution
     again = pb.maps.map_file(*paths, scene=SETUP, resume=True)
     xr.testing.assert_identical(again.load(), disagreeing)
+
+
+ANGLE = "incidence_angle_offset"
+
+
+def turned(degrees: float | np.ndarray, seed: int = 4) -> xr.Dataset:
+    """Plates on a stage that stands some degrees further than stated."""
+    image, rng = plate_image(SIDE, SIDE, seed=seed), np.random.default_rng(seed)
+    index, fraction = (image[f"true_{name}"].to_numpy()[..., None] for name in NAMES)
+    true = np.radians(VIEWS + np.broadcast_to(degrees, (SIDE, SIDE))[..., None])
+    noise = NOISE * rng.normal(size=image["q"].shape)
+    q = np.clip(plate_q(index, fraction, true) + noise, -1.0, 1.0)
+    return image.assign(q=(image["q"].dims, q))
+
+
+@pytest.mark.thorough
+def test_an_image_determines_what_its_set_up_shares_as_far_as_pixels_agree(monkeypatch):
+    monkeypatch.setattr(fit_map, "SHARED_PIXELS", SIDE**2)
+    known, shared = (pb.physics.input_quantities.IncidenceAngle(),), (*SHARED, ANGLE)
+    stage = pb.setups.Setup(PLATE, LINKS, known=known, shared=shared)
+    row = pb.maps.shared_parameters(pb.fit_pixels(turned(1.0), scene=stage)).loc[ANGLE]
+    sd = (row["q97.5"] - row["q2.5"]) / 3.92
+    assert abs(row["q50"] - 1.0) < 3.5 * sd  # once in 2,000 seeds
+    assert sd < 0.2  # the prior has .5
+
+    halves = np.where(np.arange(SIDE) < SIDE // 2, -4.0, 4.0) * np.ones((SIDE, 1))
+    image = turned(halves)
+    maps = pb.fit_pixels(image, scene=stage)
+    (caution,) = pb.maps.shared_cautions(maps)
+    assert f"{ANGLE}: one value should serve the whole image, but pixels do not agree" in caution
+    assert "intervals contain its standard uncertainty instead" in caution
+    xr.testing.assert_equal(maps, pb.fit_pixels(image, scene=stage, shared=SHARED))
+    assert maps["shared"].to_numpy().tolist() == [*SHARED, ANGLE]
 
 
 def test_another_number_of_draws_compiles_nothing() -> None:

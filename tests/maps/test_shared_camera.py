@@ -8,19 +8,30 @@ from scipy import stats
 
 import polar_bayes as pb
 from polar_bayes.maps.fit_map import estimate_plan, plan_map
+from polar_bayes.physics.input_quantities import LightZenith
+
+LAMP = "light_zenith_offset"
 
 pytestmark = pytest.mark.thorough
 
 
-def test_an_image_of_a_camera_shares_its_polarizer() -> None:
-    assert pb.setups.SETUPS["camera"].shared == ("dolp_gain",)
-    truth = {"dolp_gain": np.asarray(0.93), "roughness": np.full((24, 24), 0.2)}
+def test_an_image_of_a_camera_shares_its_polarizer_and_its_lamp() -> None:
+    assert pb.setups.SETUPS["camera"].shared == ("dolp_gain", LAMP)
+    truth = {"dolp_gain": 0.93, LAMP: -1.5}
+    drawn = {name: np.asarray(x) for name, x in truth.items()}
+    drawn["roughness"] = np.full((24, 24), 0.2)
     protocol = pb.simulation.Protocol(views=12, wavelengths=(), largest_view_zenith=75.0)
-    image = pb.simulate("plastic", scene="camera", protocol=protocol, parameters=truth, seed=1)
-    row = pb.maps.shared_parameters(pb.fit_pixels(image, scene="camera")).loc["dolp_gain"]
-    width = 4.0 / 1.96  # four sds: once in 16,000 right models
-    assert row["q50"] - width * (row["q50"] - row["q2.5"]) < 0.93
-    assert row["q50"] + width * (row["q97.5"] - row["q50"]) > 0.93
+    scene = pb.setups.SETUPS["camera"].scene.known_to((LightZenith(),))
+    asked = {"scene": scene, "links": pb.setups.SETUPS["camera"].links, "protocol": protocol}
+    image = pb.simulate("plastic", **asked, parameters=drawn, seed=1)
+    maps = pb.fit_pixels(image, scene="camera")
+    rows = pb.maps.shared_parameters(maps)
+    width = 4.0 / 1.96  # four sds, of two: once in 8,000 right models
+    for name, true in truth.items():
+        row = rows.loc[name]
+        assert row["q50"] - width * (row["q50"] - row["q2.5"]) < true, name
+        assert row["q50"] + width * (row["q97.5"] - row["q50"]) > true, name
+    assert LAMP not in pb.maps.setup_shares(maps)
 
 
 def test_an_exposure_that_pixels_know_is_found_beside_noise_that_they_do_not() -> None:

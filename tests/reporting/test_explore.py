@@ -181,17 +181,26 @@ def test_each_pixel_may_have_directions_of_its_own() -> None:
 
 @pytest.mark.thorough
 @pytest.mark.usefixtures("compiled_in_haste")
-@each(("scene", "wavelengths"), [("camera", ()), ("paper", (450.0, 550.0, 600.0, 650.0))])
-def test_fitted_values_are_those_of_the_scene(scene: str, wavelengths: tuple) -> None:
+@each(
+    ("scene", "wavelengths", "shared"),
+    [
+        ("camera", (), {}),
+        ("camera", (), {"light_zenith_offset": 2.0}),
+        ("paper", (450.0, 550.0, 600.0, 650.0), {}),
+    ],
+)
+def test_fitted_values_are_those_of_the_scene(scene: str, wavelengths: tuple, shared: dict) -> None:
     protocol = pb.simulation.Protocol(views=10, wavelengths=wavelengths)
     one = pb.simulate("plastic", scene=scene, protocol=protocol, seed=1)
-    request = resolve(one, "per_material", *[None] * 4, 0, "double", shared=())
-    own = {n: wavelengths if n in SPECTRAL else () for n in request.priors}
+    request = resolve(one, "per_material", *[None] * 4, 0, "double", shared=tuple(shared))
+    own = {n: wavelengths if n in SPECTRAL else () for n in request.priors if n not in shared}
     sizes = {name: (2, 3, *([len(axis)] if axis else [])) for name, axis in own.items()}
     rng = np.random.default_rng(0)
     means = {name: rng.uniform(0.4, 0.6, size) for name, size in sizes.items()}
     means["refractive_index"] += 1.0
-    maps = make_maps(means, wavelengths=wavelengths, **request.describe())
+    about = {"quantiles": {"0.025": 0.0, "0.975": 0.0}, "pixels": 512, "disagreement": 0.0}
+    found = {n: {**about, "quantiles": {**about["quantiles"], "0.5": x}} for n, x in shared.items()}
+    maps = make_maps(means, wavelengths=wavelengths, shared=found, **request.describe())
     capture = one.expand_dims(y=2, x=3).copy(deep=True)
     capture["view_zenith"] += rng.normal(0.0, 0.5, capture["view_zenith"].shape)
 
@@ -204,7 +213,7 @@ def test_fitted_values_are_those_of_the_scene(scene: str, wavelengths: tuple) ->
             at = {n: x[1, 2] if x.ndim == 2 else x[1, 2, color] for n, x in means.items()}
             light = {} if color is None else {"wavelength": wavelengths[color]}
             geometry = pb.Geometry.from_degrees(**angles, **light)
-            expected = np.asarray(request.scene.predict(at, geometry)[name])
+            expected = np.asarray(request.scene.predict(at | shared, geometry)[name])
             expected = expected * (at["exposure"] if name == "intensity" else 1.0)
             panel, kinds = next(panels)
             fitted = decoded(kinds[1], panel["scale"]).reshape(2, 3, -1)[1, 2]
