@@ -18,7 +18,7 @@ CODE = {
     "diagnostics": 1877,
     "importers": 2102,
     "inference": 2769,
-    "maps": 1922,
+    "maps": 1925,
     "methods": 1280,
     "numerics": 1006,
     "observation": 515,
@@ -27,12 +27,12 @@ CODE = {
     "scenes": 1772,
     "own files": 1595,
     "models": 332,
-    "tests": 23202,
+    "tests": 23208,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 26066,
+    "code": 26069,
     "classes": 336,
     "constants": 426,
     "Any": 178,

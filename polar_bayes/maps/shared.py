@@ -101,9 +101,14 @@ class SharedParameter:
         """Return standard scores of draws, in the shape of the draws, given the set-up's errors."""
         # Some pixels have as many draws as they need, and JAX compiles for each length: those of
         # 2**14 are computed together.
+        transform, values = dist.biject_to(prior.support), np.float32(draws[self.name])
         with jax.enable_x64(True):
-            inverse = functools.partial(_coordinates_of, dist.biject_to(prior.support))
-            x = map_elements(inverse, np.asarray(draws[self.name], float), 2**14)
+            inverse = functools.partial(_coordinates_of, transform)
+            x = map_elements(inverse, values.astype(float), 2**14)
+            if not np.isfinite(x).all():
+                # Rounded to the end of its support, such as a gain of 1: its neighbor is inside.
+                inside = np.nextafter(values, np.float32(_values(transform, np.zeros(()))))
+                x = np.where(np.isfinite(x), x, map_elements(inverse, inside.astype(float), 2**14))
         moved = sum(move * draws[name] for name, move in self.by_setup.items())
         return (x - self.mean - moved) / self.sd
 

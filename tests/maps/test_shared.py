@@ -170,6 +170,15 @@ def test_an_image_determines_what_its_set_up_shares_as_far_as_pixels_agree(monke
     assert maps["shared"].to_numpy().tolist() == [*SHARED, ANGLE]
 
 
+def test_a_draw_at_the_end_of_its_support_has_a_score() -> None:
+    """In single precision, a gain within 3e-8 of 1 is 1, where its coordinate is infinite."""
+    gain, prior = SharedParameter("dolp_gain", 2.0, 0.5), pb.PRIORS["dolp_gain"]
+    draws = np.float32([0.0, 1e-6, 0.5, 1.0 - 1e-6, 1.0])
+    scores = gain.scores(prior, {"dolp_gain": draws})
+    assert np.isfinite(scores).all()
+    assert (np.diff(scores) > 0.0).all()
+
+
 def test_another_number_of_draws_compiles_nothing() -> None:
     # Some pixels have as many draws as they need, and a block may have no pixel with any.
     gain, prior = SharedParameter("dolp_gain", 2.0, 0.5), pb.PRIORS["dolp_gain"]
