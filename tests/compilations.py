@@ -17,8 +17,8 @@ def fit_alone(patch) -> None:
     patch.setattr("polar_bayes.scenes.fitting.fit_request", alone)
 
 
-FAST: LRUCache = LRUCache(16)
-"""Models that were compiled fast."""
+FAST = {"inference.compiled_model._COMPILED": LRUCache(16), "simulation._RECORDERS": LRUCache(16)}
+"""What was compiled fast, by where the package keeps it: models, and records of captures."""
 
 
 def drop_programs() -> None:
@@ -52,10 +52,9 @@ def compiled_fast(monkeypatch, *, starts, typical, draws, block):
         "scenes.fit_request.PRIOR_DRAWS": draws,
         "inference.program.BLOCK": block,
     }
-    for name, number in numbers.items():
-        monkeypatch.setattr(f"polar_bayes.{name}", number)
     # Other tests of this process must not meet what was compiled and searched in haste.
-    monkeypatch.setattr("polar_bayes.inference.compiled_model._COMPILED", FAST)
+    for name, value in {**numbers, **FAST}.items():
+        monkeypatch.setattr(f"polar_bayes.{name}", value)
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
