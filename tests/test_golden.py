@@ -10,13 +10,14 @@ say how much. Numbers change only with a reason, which the commit that changes t
 
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 import xarray as xr
+from compilations import drop_programs
 
 import polar_bayes as pb
 
@@ -157,6 +158,13 @@ def differences(case: str, found: dict, stored: dict) -> list[str]:
         if not abs(value - was) <= limit:
             wrong.append(f"{case}: {name}: {was:.8g} -> {value:.8g} (allowed {limit:.2g})")
     return wrong
+
+
+@pytest.fixture(autouse=True)
+def few_programs() -> Iterator[None]:
+    """Let each case start with few programs: all of them are more than a process can hold."""
+    yield
+    drop_programs()
 
 
 @pytest.mark.thorough
