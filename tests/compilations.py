@@ -21,6 +21,13 @@ FAST = {"inference.compiled_model._COMPILED": LRUCache(16), "simulation._RECORDE
 """What was compiled fast, by where the package keeps it: models, and records of captures."""
 
 
+def compile_anew(patch) -> None:
+    """Forget what other tests compiled: JAX finds it in memory, however it was optimized."""
+    jax.clear_caches()
+    for name in FAST:
+        patch.setattr(f"polar_bayes.{name}", LRUCache(16))
+
+
 def drop_programs() -> None:
     """Linux gives a process 65,530 memory maps, and XLA crashes without one for a program."""
     maps = Path("/proc/self/maps")

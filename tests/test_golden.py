@@ -10,14 +10,14 @@ say how much. Numbers change only with a reason, which the commit that changes t
 
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 import xarray as xr
-from compilations import drop_programs
+from compilations import compile_anew
 
 import polar_bayes as pb
 
@@ -161,10 +161,9 @@ def differences(case: str, found: dict, stored: dict) -> list[str]:
 
 
 @pytest.fixture(autouse=True)
-def few_programs() -> Iterator[None]:
-    """Let each case start with few programs: all of them are more than a process can hold."""
-    yield
-    drop_programs()
+def few_programs(monkeypatch) -> None:
+    """Let each case start with none: together they are more than a process can hold."""
+    compile_anew(monkeypatch)
 
 
 @pytest.mark.thorough
