@@ -161,7 +161,7 @@ def differences(case: str, found: dict, stored: dict) -> list[str]:
 
 
 @pytest.fixture(autouse=True)
-def few_programs(monkeypatch) -> None:
+def own_programs(monkeypatch) -> None:
     """Let each case start with none: together they are more than a process can hold."""
     compile_anew(monkeypatch)
 

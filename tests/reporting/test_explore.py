@@ -198,8 +198,8 @@ def test_fitted_values_are_those_of_the_scene(scene: str, wavelengths: tuple, sh
     rng = np.random.default_rng(0)
     means = {name: rng.uniform(0.4, 0.6, size) for name, size in sizes.items()}
     means["refractive_index"] += 1.0
-    about = {"quantiles": {"0.025": 0.0, "0.975": 0.0}, "pixels": 512, "disagreement": 0.0}
-    found = {n: {**about, "quantiles": {**about["quantiles"], "0.5": x}} for n, x in shared.items()}
+    about, levels = {"pixels": 512, "disagreement": 0.0}, ("0.025", "0.5", "0.975")
+    found = {n: {**about, "quantiles": dict.fromkeys(levels, x)} for n, x in shared.items()}
     maps = make_maps(means, wavelengths=wavelengths, shared=found, **request.describe())
     capture = one.expand_dims(y=2, x=3).copy(deep=True)
     capture["view_zenith"] += rng.normal(0.0, 0.5, capture["view_zenith"].shape)
