@@ -27,7 +27,7 @@ CODE = {
     "scenes": 1772,
     "own files": 1595,
     "models": 332,
-    "tests": 23214,
+    "tests": 23226,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 

@@ -20,6 +20,8 @@ import xarray as xr
 from compilations import compile_anew
 
 import polar_bayes as pb
+from polar_bayes.inference.program import PRIOR_DRAWS
+from polar_bayes.numerics.optimize import SETTLED
 
 STORED = Path(__file__).with_suffix("").with_name("golden.json")
 TIGHT, SAMPLED = 1e-5, 5.0
@@ -109,7 +111,11 @@ def identification():
 
 
 def curve():
-    return finite_numbers(pb.profile(capture(10), "refractive_index", seed=1), first=24)
+    """Heights are differences of two searches, each within half of SETTLED squared of its peak."""
+    numbers = finite_numbers(pb.profile(capture(10), "refractive_index", seed=1), first=24)
+    beside = 1.5 / PRIOR_DRAWS  # by rounding one draw, not two, may lie on an end's other side
+    known = {"profile": SETTLED**2, "prior_beyond": beside}
+    return {name: (x, known.get(name.split()[0], 0) / SAMPLED) for name, (x, _) in numbers.items()}
 
 
 def views():
@@ -142,7 +148,7 @@ CASES: dict[str, Callable] = {
     "next views": views,
     "effects": effects,
 }
-OPTIMIZED = {"point", "identify", "profile", "next views", "effects"}
+OPTIMIZED = {"point", "identify", "next views", "effects"}
 
 
 def differences(case: str, found: dict, stored: dict) -> list[str]:

@@ -66,6 +66,15 @@ def squared(data, scene, priors, links) -> None:
         numpyro.sample("q", dist.Normal(mean, 0.05), obs=data.readings["q"])
 
 
+def waves(data, scene, priors, links) -> None:
+    """Readings of a wave: each of many frequencies is better than those beside it."""
+    del scene, priors, links
+    frequency = numpyro.sample("frequency", dist.Uniform(0.0, 500.0))
+    with numpyro.plate("view", data.shape[-1]):
+        x = np.linspace(0.0, 1.0, data.shape[-1]) ** 2
+        numpyro.sample("q", dist.Normal(jnp.sin(frequency * x), NOISE), obs=data.readings["q"])
+
+
 def funnel(data, scene, priors, links) -> None:
     """Readings that say nothing of a funnel: its peak is far from where most of it lies."""
     del scene, priors, links

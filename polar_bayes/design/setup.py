@@ -16,19 +16,13 @@ from polar_bayes.diagnostics.parameters import Scalar, label_scalars
 from polar_bayes.errors import FitError
 from polar_bayes.inference.compiled_model import CompiledModel
 from polar_bayes.inference.files import check_fit
-from polar_bayes.inference.initialization import CANDIDATES, STARTS
+from polar_bayes.inference.initialization import modes_from_prior
 from polar_bayes.inference.problem import compile_request
 from polar_bayes.inference.program import PRIOR_DRAWS, Program, from_prior, places
 from polar_bayes.inference.request import Request
 from polar_bayes.inference.result import PROVENANCE
 from polar_bayes.numerics.compile import compiled
-from polar_bayes.numerics.optimize import (
-    Modes,
-    NumpyPotential,
-    ValueAndGradient,
-    find_modes,
-    likely_starts,
-)
+from polar_bayes.numerics.optimize import Modes, NumpyPotential, ValueAndGradient
 from polar_bayes.observation.data import Observations
 from polar_bayes.progress import Progress, no_progress
 
@@ -97,8 +91,7 @@ def posterior_modes(
     potential = potential or NumpyPotential(
         problem.program.value_and_gradient, problem.data, problem.data.brightness.dtype
     )
-    starts = likely_starts(potential, problem.prior[: CANDIDATES * STARTS], STARTS)
-    return find_modes(potential, starts, progress or no_progress)
+    return modes_from_prior(potential, problem.prior, progress or no_progress)
 
 
 # --- Names of parameters and coordinates ----------------------------------------------------------

@@ -160,6 +160,12 @@ class AbstractInit(abc.ABC):
         """Return the weight of the heaviest mode that some chain never visited."""
 
 
+def modes_from_prior(potential: ValueAndGradient, drawn: np.ndarray, progress: Progress) -> Modes:
+    """Search for the joint modes from the likeliest of draws (draw, size) from the prior."""
+    likely = likely_starts(potential, drawn[: CANDIDATES * STARTS], STARTS)
+    return find_modes(potential, likely, progress)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class JointInit(AbstractInit):
     """Initialization of one material: joint coordinates, dense metric from the Hessian."""
@@ -318,8 +324,7 @@ class HierarchicalInit(AbstractInit):
 
 def _weigh(potential: ValueAndGradient, z: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
     """Return log densities and log importance weights of affine maps of normal noise."""
-    lp = -np.array([potential(draw)[0] for draw in z.reshape(-1, z.shape[-1])])
-    lp = lp.reshape(z.shape[:2])
+    lp = np.apply_along_axis(lambda draw: -potential(draw)[0], -1, z)
     return {"lp": lp, "log_weight": lp + 0.5 * np.sum(noise**2, axis=-1)}
 
 
@@ -376,7 +381,7 @@ class JointInitializer(AbstractInitializer):
     def find(self, data: Observations, key: Array, progress: Progress) -> AbstractInit:
         potential = NumpyPotential(self.program.value_and_gradient, data, data.brightness.dtype)
         drawn = from_prior(self.program, key, CANDIDATES * STARTS, data)
-        modes = find_modes(potential, likely_starts(potential, drawn, STARTS), progress)
+        modes = modes_from_prior(potential, drawn, progress)
         metadata = {
             "starts": modes.starts,
             "failures": modes.failures,
@@ -439,14 +444,12 @@ def _guide(
     # The guide orders sites as the model declares them, the program by name. The guide's own search
     # for a starting point is not needed, and compilation removes it.
     order = jnp.zeros(program.size, int)
-    guide = AutoLaplaceApproximation(
-        program.model, hessian_fn=lambda _, location: precision[order][:, order]
-    )
-    handlers.seed(guide, jax.random.key(0))(data)
+    auto = AutoLaplaceApproximation(program.model, hessian_fn=lambda *_: precision[order][:, order])
+    handlers.seed(auto, jax.random.key(0))(data)
     numbers = jnp.arange(program.size, dtype=mode.dtype)
-    unpacked = guide._unpack_latent(numbers)
+    unpacked = auto._unpack_latent(numbers)
     for name, positions in program.unravel(numbers).items():
         of_guide = unpacked[name].ravel().astype(int)
         order = order.at[of_guide].set(positions.ravel().astype(int))
-    posterior = guide.get_posterior({"auto_loc": mode[order]})
+    posterior = auto.get_posterior({"auto_loc": mode[order]})
     return posterior.loc, posterior.scale_tril, order

@@ -15,7 +15,6 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from polar_bayes.inference.compiled_model import CompiledModel
-from polar_bayes.inference.initialization import STARTS
 from polar_bayes.inference.problem import Problem
 from polar_bayes.inference.program import Program, from_prior
 from polar_bayes.methods.method import AbstractMethod, PosteriorDraws
@@ -42,10 +41,9 @@ class Point(AbstractMethod):
 
     @override
     def run(self, problem: Problem, key: Array, progress: Progress) -> PosteriorDraws:
-        # The starts are those from which other methods search for modes.
-        starts = from_prior(problem.program, problem.key, STARTS, problem.data)
+        starts = from_prior(problem.program, problem.key, self.starts, problem.data)
         program, solve = problem.program, problem.compiled_model.made(_solver, None)
-        found = solve(jnp.asarray(starts[: self.starts]), problem.data)
+        found = solve(jnp.asarray(starts), problem.data)
         return PosteriorDraws(
             method="point",
             z=np.asarray(found.z)[None, None],

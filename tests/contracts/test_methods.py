@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from cases import each
 from plates import at_mirror
-from toy_models import VIEWS, capture, least_squares, line, of_line
+from toy_models import VIEWS, capture, least_squares, line, of_line, waves
 
 import polar_bayes as pb
 from polar_bayes.inference.batching import Status
@@ -24,8 +24,8 @@ METHODS = {
 }
 
 
-def fit(method: object) -> xr.DataTree:
-    return pb.fit(capture(), model=line, links=LINKS, method=method, seed=1)
+def fit(method: object, model=line) -> xr.DataTree:
+    return pb.fit(capture(), model=model, links=LINKS, method=method, seed=1)
 
 
 def names(**able: bool) -> list:
@@ -74,6 +74,11 @@ def test_a_point_fit_finds_the_line_of_least_squares() -> None:
     rows = pb.diagnostics.json_summary(fit(pb.methods.Point(starts=2)))["parameters"]
     found = [rows[parameter]["mean"] for parameter in ("level", "slope")]
     np.testing.assert_allclose(found, least_squares(capture()["q"].to_numpy()), atol=0.02)
+
+
+def test_a_point_fit_descends_from_as_many_starts_as_are_asked() -> None:
+    few, many = (fit(pb.methods.Point(starts=number), waves) for number in (16, 256))
+    assert many["sample_stats"]["loss"].item() < few["sample_stats"]["loss"].item()
 
 
 @each("method", [*METHODS.values(), pb.methods.Point()], ids=repr)
