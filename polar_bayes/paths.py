@@ -193,7 +193,10 @@ def make_private(folder: Path) -> str:
 
 # --- Scene files ----------------------------------------------------------------------------------
 
-SCENE_KEYS = ("setup", "model", "method", "largest_view_zenith", "scene", "links", "priors")
+SCENE_KEYS = (
+    *("setup", "quantities", "model", "method", "largest_view_zenith"),
+    *("scene", "links", "priors"),
+)
 """Keys that a scene file may have (`polar_bayes.load_scene`)."""
 
 

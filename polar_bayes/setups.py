@@ -31,7 +31,13 @@ from polar_bayes.physics.input_quantities import (
     ToneCurve,
     ViewZenithScale,
 )
-from polar_bayes.physics.instrument import Analyzer, ChannelGain, Discrepancy, Instrument
+from polar_bayes.physics.instrument import (
+    Analyzer,
+    AngleZero,
+    ChannelGain,
+    Discrepancy,
+    Instrument,
+)
 from polar_bayes.physics.part import notation, parameters_of
 from polar_bayes.physics.scene import SCENES, Scene
 from polar_bayes.physics.stokes import LinearPolarization
@@ -173,7 +179,8 @@ def _at_mirror_angles(setup: Setup) -> Setup:
     others = tuple(each for each in setup.known if not isinstance(each, directions))
     if len(others) == len(setup.known):
         return setup
-    return dataclasses.replace(setup, known=(IncidenceAngle(), *others))
+    one = () if setup.scene.has(AngleZero) else (IncidenceAngle(),)  # two would be the same error
+    return dataclasses.replace(setup, known=(*one, *others))
 
 
 def _by_polarized_light(setup: Setup, angle: float) -> Setup:
@@ -217,12 +224,13 @@ def default_priors(
     """
     attrs = capture.attrs
     angle = ANGLE_ZERO[attrs.get("angle_set_by", "hand")]
-    priors = {**setup.priors, "angle_zero": angle, "incidence_angle_offset": angle}
+    priors: dict[str, dist.Distribution] = {"angle_zero": angle, "incidence_angle_offset": angle}
     if attrs.get("incident_levels") == "not given":
         priors["channel_gain_ratio"] = UNCHECKED_GAIN
     for term in setup.scene.terms:
         if isinstance(term, Discrepancy):  # as many weights as it has basis functions
             priors["discrepancy_weights"] = dist.Normal(0.0, 1.0).expand([term.basis]).to_event(1)
+    priors |= setup.priors
     priors = {name: prior for name, prior in priors.items() if name in setup.scene.parameters}
     return priors | _priors_known_to(known or {}, capture, setup, priors)
 
@@ -245,7 +253,9 @@ def _priors_known_to(
         where = f"known: {name}" if name in known else f"capture: {name}_uncertainty"
         if name not in names:
             hint = f"give some of {', '.join(names)}" if names else "a scene's terms state them"
-            if name in usual:  # no error around zero
+            if name in names.values():
+                hint = f"give it as {name.removesuffix('_offset')}"
+            elif name in usual:  # no error around zero
                 hint = f"state its prior, by priors={{{name!r}: ...}}"
             raise FitError("no input quantity of this scene", where=where, hint=hint)
         check_uncertainty(u, where)
@@ -254,6 +264,14 @@ def _priors_known_to(
         over_scale = math.sqrt(1.0 - 2.0 / math.pi) if issubclass(kind, dist.HalfNormal) else 1.0
         found[names[name]] = kind(scale=float(u) / over_scale)
     return found
+
+
+def check_known(known: object) -> Mapping[str, float]:
+    """Return standard uncertainties by name; raise FitError unless that is what is given."""
+    if not isinstance(known, Mapping | None):
+        what, hint = f"it is {known!r}", "give a mapping such as {'light_zenith': 0.2}"
+        raise FitError(what, where="known", hint=hint)
+    return known or {}
 
 
 def check_uncertainty(u: object, where: str) -> None:

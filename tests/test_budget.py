@@ -15,26 +15,26 @@ CODE = {
     "capture": 834,
     "cli": 1273,
     "design": 1135,
-    "diagnostics": 1877,
+    "diagnostics": 1879,
     "importers": 2102,
-    "inference": 2769,
-    "maps": 1925,
+    "inference": 2784,
+    "maps": 1940,
     "methods": 1280,
     "numerics": 1006,
     "observation": 515,
     "physics": 2766,
     "reporting": 3272,
-    "scenes": 1772,
-    "own files": 1595,
+    "scenes": 1782,
+    "own files": 1607,
     "models": 332,
-    "tests": 23226,
+    "tests": 23301,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 26069,
+    "code": 26120,
     "classes": 336,
-    "constants": 426,
+    "constants": 428,
     "Any": 178,
     "longest function": 80,
 }
@@ -43,8 +43,9 @@ WHOLE = {
 The plan was 20,500 lines of code, 290 classes and 180 `Any`, for a package that had 23,938 lines.
 Since then features came that were chosen over it: readers of other people's files (900 lines),
 the set-up in the interval (210) and in maps (250), a map to point at (290), second bounces and
-passages (220), programs on the disk (90), exposures that are set for the light (40), and what is
-known better beside further views (70). The other rooms became smaller by a few lines only.
+passages (220), programs on the disk (90), exposures that are set for the light (40), what is known
+better beside further views (70), and set-ups of the user's own that files, views and regions keep
+(50). The other rooms became smaller by a few lines only.
 """
 
 

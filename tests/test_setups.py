@@ -6,9 +6,14 @@ import inspect
 import numpy as np
 import pytest
 from cases import each
+from numpyro import distributions as dist
+from numpyro.distributions.transforms import SigmoidTransform
 
 import polar_bayes as pb
 from polar_bayes.errors import SceneError
+from polar_bayes.inference.request import OWN_QUANTITIES, resolve
+from polar_bayes.models.per_material import per_material
+from polar_bayes.physics.instrument import AngleZero, Instrument
 from polar_bayes.physics.scene import SCENES, Scene
 from polar_bayes.setups import SETUPS, Setup, as_read, default_priors, find_setup
 
@@ -90,11 +95,56 @@ def test_lamp_and_viewer_of_mirror_views_share_the_error_of_one_angle():
     assert as_read(setup, aside) is setup
     own = dataclasses.replace(setup, known=setup.known[:1])
     assert as_read(own, capture) is own
-    prior = default_priors(
-        dataclasses.replace(found, scene=found.scene.known_to(found.known)),
-        capture.assign_attrs(angle_set_by="stage"),
-    )
+    by_stage = capture.assign_attrs(angle_set_by="stage")
+    whole = dataclasses.replace(found, scene=found.scene.known_to(found.known))
+    prior = default_priors(whole, by_stage)
     assert prior["incidence_angle_offset"] is pb.priors.ANGLE_ZERO["stage"]
+    own = {"incidence_angle_offset": dist.Normal(0.0, 0.01)}
+    assert default_priors(dataclasses.replace(whole, priors=own), by_stage) == own
+    zero = dataclasses.replace(setup.scene, instrument=Instrument((AngleZero(),)))
+    found = as_read(dataclasses.replace(setup, scene=zero), capture)
+    assert {each.name for each in found.known} == names - apart
+
+
+def request_of(**asked):
+    protocol = pb.simulation.Protocol(views=12, wavelengths=())
+    usual = dict.fromkeys(("scene", "priors", "links", "largest_view_zenith"))
+    usual |= {"capture": pb.simulate("leaf", scene="camera", protocol=protocol)}
+    return resolve(**usual | {"model": "per_material", "seed": 0, "precision": "double"} | asked)
+
+
+def test_what_is_known_counts_more_than_a_prior_of_a_scene_file():
+    """And is refused where the model has no such error."""
+    stated = {"priors": dict(request_of().priors), "known": {"light_zenith": 0.2}}
+    request = request_of(**stated)
+    assert request.priors["light_zenith_offset"].scale == 0.2
+    assert request.swapped == ("uncertainty of light_zenith (0.2)",)
+    by_capture = request.capture.assign_attrs(light_zenith_uncertainty=0.1)
+    request = request_of(capture=by_capture)
+    assert request.swapped == ("uncertainty of light_zenith (by the capture)",)
+
+    def perfect(data, scene, priors, links):
+        per_material(data, scene.perfectly_known, priors, links)
+
+    with pytest.raises(pb.FitError, match=r"priors\['light_zenith_offset'\]: no such parameter"):
+        request_of(model=perfect, known=stated["known"])
+
+
+def test_a_set_up_with_other_quantities_is_told():
+    setup = SETUPS["camera"]
+    assert not request_of(scene=setup).swapped
+    request = request_of(scene=dataclasses.replace(setup, known=setup.known[:1]))
+    assert (request.scene_name, *request.swapped) == ("camera", OWN_QUANTITIES)
+
+
+def test_an_uncertainty_is_known_of_any_prior():
+    """NumPyro states no variance of a distribution that is transformed."""
+    gain = dist.TransformedDistribution(dist.Normal(2.0, 0.5), SigmoidTransform())
+    u = request_of(priors={"dolp_gain": gain}).standard_uncertainties(["dolp_gain"])["dolp_gain"]
+    z = np.linspace(-4.0, 8.0, 2001)
+    weight, x = np.exp(-2.0 * (z - 2.0) ** 2), 1.0 / (1.0 + np.exp(-z))
+    exact = np.cov(x, aweights=weight) ** 0.5
+    assert u == pytest.approx(exact, rel=5.0 / np.sqrt(10_000.0))
 
 
 @pytest.mark.thorough

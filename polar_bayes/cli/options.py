@@ -58,17 +58,17 @@ class Assignment(click.ParamType):
 
     @override
     def convert(self, value: str | Path, param: Param, ctx: Context) -> tuple[str, str | float]:
-        where = f"{_flag(param)} {value}"
+        where, hint = f"{_flag(param)} {value}", "write it as --known light_zenith=0.2"
         name, equals, text = str(value).partition("=")
         if not (equals and name.strip().isidentifier()):
             if self.is_named:
-                hint = "write NAME=DISTRIBUTION, such as 'angle_zero=Normal(0,3)'"
+                if not self.is_number:
+                    hint = "write NAME=DISTRIBUTION, such as 'angle_zero=Normal(0,3)'"
                 raise FitError("it does not say of what", where=where, hint=hint)
             return "", str(value)
         try:
             return name.strip(), float(text) if self.is_number else text
         except ValueError as error:
-            hint = "write it as --known light_zenith=0.2"
             raise FitError("it is no number", where=where, hint=hint) from error
 
 

@@ -58,6 +58,7 @@ from polar_bayes.observation.links import AbstractLink
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS, Scene
 from polar_bayes.progress import Progress, with_progress
 from polar_bayes.scenes.scene_file import arguments_of
+from polar_bayes.setups import Setup
 
 
 class Design(NamedTuple):
@@ -259,7 +260,9 @@ def _extended(
     """Return the model on measured views and candidates together."""
     links = {**problem.request.links, **new}
     limit, seed = problem.request.largest_view_zenith, problem.request.seed
-    scene = problem.request.scene
+    # The scene has the input quantities of its set-up already, however the capture was read.
+    scene = Setup(problem.request.scene, links)
+    priors = {**problem.request.priors, **(priors or {})}
     request = resolve(views.capture, model, scene, priors, links, limit, seed, "double")
     data = observe_request(request)
     recorded = np.broadcast_to(problem.data.brightness, problem.data.shape)

@@ -30,7 +30,7 @@ from polar_bayes.diagnostics.view import FitView, once, view_of
 from polar_bayes.errors import FitError
 from polar_bayes.frames import PrintedFrame
 from polar_bayes.physics.part import notation
-from polar_bayes.setups import check_uncertainty
+from polar_bayes.setups import check_known, check_uncertainty
 
 WEIGHTS, DISCREPANCY = "discrepancy_weights", "model discrepancy"
 """Parameters of a smooth error over angle, and their row in the table."""
@@ -54,8 +54,9 @@ def budget(
         A row for each scalar parameter of the material, in its unit: the posterior's standard
         deviation `sd`; `perfect`, what it would be in a set-up known perfectly; and what
         contributes to `sd`, in squares: the `noise`, the `prior`, the `model discrepancy` where the
-        scene has one, and each input quantity, which has a sign. Columns that end in
-        `halved` have what `sd` would be if that quantity alone were known twice as well. The
+        scene has one, and the prior of each input quantity, which has a sign. What readings tell of
+        a quantity is in their noise, so that a part is not the gain of knowing it. Columns that
+        end in `halved` have what `sd` would be if that quantity alone were known twice as well. The
         attribute `known` has the standard uncertainties of the quantities.
 
     Raises:
@@ -63,13 +64,13 @@ def budget(
     """
     fit = view_of(result)
     if not has_budget(fit):
-        raise FitError(
-            "it has no input quantities of its set-up",
-            where="budget: result",
-            hint="fit with a set-up whose scene has input quantities, such as camera",
-        )
+        what = "it has no input quantities of its set-up"
+        hint = "fit with a set-up whose scene has input quantities, such as camera"
+        if fit.method == "point":
+            what, hint = "a point fit has no intervals", "fit by another method, such as importance"
+        raise FitError(what, where="budget: result", hint=hint)
     errors, stated = _errors(fit), _stated(fit)
-    asked = _asked(stated, known or {})
+    asked = _asked(stated, known)
     # Of the readings, and of all priors but those of the input quantities.
     weights = {each.label: each for each in fit.scalars if each.name == WEIGHTS}
     names = {each.name for each in (*errors.values(), *weights.values())}
@@ -120,10 +121,9 @@ def _row(
     if not np.isfinite(joint).all():
         return [np.nan] * (4 + bool(weights.size) + 2 * count)
     known, now = (pd.Series([*each, *weights]) for each in (stated, asked))
-    variance, with_errors = _known_otherwise(joint, known, now)
+    variance, parts = _known_otherwise(joint, known, now)
     own = joint[1 : count + 1, 1 : count + 1], joint[0, 1 : count + 1]
     perfect = joint[0, 0] - own[1] @ np.linalg.lstsq(*own)[0]
-    parts = with_errors / now.to_numpy()
     rest = variance - np.sum(parts**2)
     variances = [variance, perfect, noise * rest, (1.0 - noise) * rest]
     variances += [np.sum(parts[count:] ** 2)] if weights.size else []
@@ -139,11 +139,15 @@ def _row(
 def _known_otherwise(
     joint: Float[np.ndarray, "n n"], stated: pd.Series, asked: pd.Series
 ) -> tuple[float, Float[np.ndarray, " quantity"]]:
-    """Return variance and covariances of a parameter under other priors of input quantities."""
-    # Other standard uncertainties change the precision of each prior.
-    change = np.diag(asked.to_numpy() ** -2.0 - stated.to_numpy() ** -2.0)
-    left = np.linalg.lstsq(np.eye(len(stated)) + joint[1:, 1:] @ change, joint[0, 1:])[0]
-    return float(joint[0, 0] - joint[0, 1:] @ change @ left), left
+    """Return variance and contributions for a parameter under other priors of input quantities."""
+    # In units of the priors. Readings only add to their precision: what the covariance of the draws
+    # has beyond 1 is Monte Carlo error, which a wider prior would multiply.
+    u, ratio = stated.to_numpy(), np.clip((asked / stated).to_numpy(), 1e-6, 1e6)
+    values, vectors = np.linalg.eigh(joint[1:, 1:] / np.outer(u, u))
+    own = (vectors * np.clip(values, 0.0, 1.0)) @ vectors.T
+    other = np.linalg.solve(np.eye(u.size) + own @ np.diag(ratio**-2.0 - 1.0), own)
+    slopes = np.linalg.lstsq(joint[1:, 1:], joint[0, 1:])[0] * u
+    return float(joint[0, 0] + slopes @ (other - own) @ slopes), other @ slopes / ratio
 
 
 def variance_shares(table: pd.DataFrame) -> pd.DataFrame:
@@ -153,14 +157,14 @@ def variance_shares(table: pd.DataFrame) -> pd.DataFrame:
     return table[sds].join(parts.div(parts.sum(axis=1), axis=0))
 
 
-def _asked(stated: pd.Series, known: Mapping[str, float]) -> pd.Series:
+def _asked(stated: pd.Series, known: Mapping[str, float] | None) -> pd.Series:
     """Return standard uncertainties, with the caller's values where given."""
-    for name, value in known.items():
+    for name, value in check_known(known).items():
         if name not in stated.index:
             hint = f"give some of {join(list(stated.index))}"
             raise FitError("it is no input quantity of this fit", where=f"known: {name}", hint=hint)
         check_uncertainty(value, f"known: {name}")
-    return pd.Series({**stated.to_dict(), **known}, dtype=float)
+    return pd.Series({**stated.to_dict(), **(known or {})}, dtype=float)
 
 
 def _share_of_noise(scalar: Scalar, densities: list[np.ndarray | None]) -> float:

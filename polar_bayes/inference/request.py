@@ -38,6 +38,7 @@ from polar_bayes.setups import (
     UNSTATED,
     Setup,
     as_read,
+    check_known,
     default_priors,
     find_setup,
     setup_name,
@@ -51,6 +52,9 @@ MODELS: dict[str, Callable] = {
 
 MIN_VIEWS = 2
 """Fewest valid views with which a capture, or a pixel, is fitted."""
+
+OWN_QUANTITIES = "input quantities of the set-up"
+"""What a user replaced by a `Setup` that is known otherwise."""
 
 _MODEL_INFO: LRUCache[ModelInfo] = LRUCache(32)
 
@@ -80,7 +84,7 @@ class Request(ModelParts):
         """Return standard deviations of the priors of scalar parameters of the instrument."""
         terms = (each for each in self.scene.terms if not isinstance(each, Discrepancy))
         priors = {name: self.priors[name] for name in parameters_of(*terms) if name in sampled}
-        variances = {name: float(np.sum(prior.variance)) for name, prior in priors.items()}
+        variances = {name: _variance(prior) for name, prior in priors.items()}
         return {name: math.sqrt(x) for name, x in variances.items() if 0.0 < x < math.inf}
 
     def describe(self) -> Provenance:
@@ -94,6 +98,14 @@ class Request(ModelParts):
             "links": {name: repr(link) for name, link in self.links.items()},
             "seed": self.seed,
         }
+
+
+def _variance(prior: dist.Distribution) -> float:
+    """Return the variance of a scalar prior, by draws where NumPyro does not state it."""
+    try:
+        return float(np.sum(prior.variance))
+    except NotImplementedError:  # of a transformed distribution, say
+        return float(np.sum(np.var(prior.sample(jax.random.key(0), (10_000,)), axis=0)))
 
 
 def resolve(
@@ -114,17 +126,9 @@ def resolve(
     A pixel, with names that an image shares, carries input quantities that it does not sample.
     """
     capture = validate(capture)
-    if {"y", "x"} & set(map(str, capture.dims)):
-        raise CaptureError(
-            "an image has too many materials for one joint fit",
-            where=f"{capture.attrs.get('name', 'capture')}: dims y, x",
-            hint="average a region into one capture first, for example capture.mean(('y', 'x'))",
-        )
-    chosen_by = "caller"
-    if scene is None:
-        chosen_by = "capture" if "setup" in capture.attrs else "default"
-        scene = str(capture.attrs.get("setup", UNSTATED))
-    setup, scene_name = _find_scene(scene, capture)
+    _refuse_images(capture)
+    setup, scene_name, chosen_by = _find_scene(scene, capture)
+    others_known = setup.known != SETUPS.get(scene_name, setup).known
     setup = as_read(setup, capture)
     setup, whole = _known_to(setup, capture, shared)
     chosen = _choose_links(capture, setup, links)
@@ -133,11 +137,13 @@ def resolve(
     _check_views(capture, limit)
     function = model if callable(model) else _find_model(model)
     PriorTable(priors)  # refuses what names no priors
-    given = dict(priors or {})
+    known = check_known(known)  # and counts more: a scene file of a result lists every prior
+    given = {n: x for n, x in (priors or {}).items() if _quantity(n) not in known}
     usual = ({} if shared is None else _pixel_priors()) | default_priors(whole, capture, known)
     carried = set(whole.scene.parameters) - set(setup.scene.parameters)
     same = {n: x for n, x in {**PRIORS, **usual}.items() if _are_same(given.get(n), x)}
     own = {name: prior for name, prior in given.items() if name not in same}
+    asked = given.keys() | {name for name in usual if _quantity(name) in known}
     every = usual | own | same
     stated = {name: prior for name, prior in every.items() if name not in carried}
     parts = ModelParts(function, setup.scene, stated, chosen)
@@ -146,12 +152,15 @@ def resolve(
         with TRACING_LOCK:
             key = parts.key(layout_of(data))
             found = _MODEL_INFO.of(key, lambda: inspect_model(parts, data))
+    by_capture = [n for n in map(_quantity, usual) if f"{n}_uncertainty" in capture.attrs]
     swapped = {
         "scene": scene_name == "custom",
+        OWN_QUANTITIES: others_known,
         "model": callable(model),
         "links": links is not None and chosen != _usual_links(capture, setup),
         **{f"prior of {name}": True for name in own},
-        **{f"uncertainty of {name} ({u:g})": True for name, u in (known or {}).items()},
+        **{f"uncertainty of {name} ({u:g})": True for name, u in known.items()},
+        **{f"uncertainty of {n} (by the capture)": n not in known for n in by_capture},
         **{f"{name} held fixed": True for name in found.fixed},
     }
     return Request(
@@ -163,7 +172,7 @@ def resolve(
         scene_chosen_by=chosen_by,
         priors=resolve_priors(
             found.priors,
-            {n: prior for n, prior in stated.items() if n in found.priors or n in given},
+            {n: prior for n, prior in stated.items() if n in found.priors or n in asked},
         ),
         carried={n: {**PRIORS, **every}[n] for n in whole.scene.parameters if n in carried},
         scene_with_setup=whole.scene,
@@ -176,6 +185,11 @@ def resolve(
         precision=precision,
         shared=tuple(n for n in setup.shared if n in found.priors or n in carried),
     )
+
+
+def _quantity(parameter: object) -> str:
+    """Return the name by which `known` states the error of a parameter."""
+    return str(parameter).removesuffix("_offset")
 
 
 def _known_to(
@@ -197,6 +211,15 @@ def _pixel_priors() -> dict[str, dist.Distribution]:
     return {"exposure": dist.LogNormal(exposure.loc, exposure.scale)}
 
 
+def _refuse_images(capture: xr.Dataset) -> None:
+    if {"y", "x"} & set(map(str, capture.dims)):
+        raise CaptureError(
+            "an image has too many materials for one joint fit",
+            where=f"{capture.attrs.get('name', 'capture')}: dims y, x",
+            hint="average a region into one capture first, for example capture.mean(('y', 'x'))",
+        )
+
+
 def _check_settings(limit: float, precision: str, seed: int) -> None:
     what, hint = "", ""
     if not 0.0 < limit <= 90.0:
@@ -209,13 +232,16 @@ def _check_settings(limit: float, precision: str, seed: int) -> None:
         raise FitError(what, where="fit", hint=hint)
 
 
-def _find_scene(scene: object, capture: xr.Dataset) -> tuple[Setup, str]:
-    """Return the set-up of the caller, given by name or value, and its name."""
+def _find_scene(scene: object, capture: xr.Dataset) -> tuple[Setup, str, str]:
+    """Return the set-up, given by name or value, its name, and who chose it."""
+    if scene is None:
+        name = str(capture.attrs.get("setup", UNSTATED))
+        return find_setup(name), name, "capture" if "setup" in capture.attrs else "default"
     if isinstance(scene, str):
-        return find_setup(scene), scene
+        return find_setup(scene), scene, "caller"
     if isinstance(scene, Setup):
-        return scene, setup_name(scene)
-    return _setup_around(scene, capture), "custom"
+        return scene, setup_name(scene), "caller"
+    return _setup_around(scene, capture), "custom", "caller"
 
 
 def _usual_links(capture: xr.Dataset, setup: Setup) -> dict[str, AbstractLink]:

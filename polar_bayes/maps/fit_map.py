@@ -400,6 +400,7 @@ def _intensity_unit(capture: xr.Dataset) -> float | None:
 def provenance_json(plan: MapPlan) -> str:
     """Return the provenance of maps as JSON."""
     request = plan.request
+    own, shared = plan.engine.program.supports, [each.name for each in plan.shared]
     provenance = {
         **request.describe(),
         "method": name_of(plan.settings),
@@ -412,6 +413,7 @@ def provenance_json(plan: MapPlan) -> str:
         "shared": {each.name: _described(each, plan) for each in plan.shared},
         "shared_by_default": plan.shares_by_default,
         "carried": {each.name: each.sd for each in plan.carried},
+        "of_each_pixel": [n for n in request.standard_uncertainties(own) if n not in shared],
         **plan.found,
     }
     return json.dumps(provenance, sort_keys=True)

@@ -357,7 +357,7 @@ def shared_cautions(maps: xr.Dataset) -> list[str]:
     return cautions + [
         f"{name} is shared by all pixels, and they do not agree about it (information matrix test "
         f"{row['disagreement']:.1f}, above {DISAGREEMENT:g} once in a thousand right models): "
-        "intervals may be too narrow. Let each pixel have its own."
+        "intervals may be too narrow. Leave it out of shared=."
         for name, row in found[found["disagreement"] > DISAGREEMENT].iterrows()
     ]
 

@@ -57,7 +57,10 @@ def carried(priors: Mapping[str, dist.Distribution]) -> tuple[Carried, ...]:
     """
     found = []
     for name, prior in priors.items():
-        mean, sd = np.asarray(prior.mean), np.sqrt(np.asarray(prior.variance))
+        try:
+            mean, sd = np.asarray(prior.mean), np.sqrt(np.asarray(prior.variance))
+        except NotImplementedError:  # of a transformed distribution, say
+            mean = sd = np.array(np.nan)
         if mean.shape or not (np.isfinite(mean) and 0.0 < sd < np.inf):
             what = "a map needs its mean and a standard deviation above 0"
             hint = "give a distribution such as Normal(0, 0.5), or known= a standard uncertainty"
@@ -130,6 +133,9 @@ class Propagation:
         good = np.where(is_known, Status.GOOD, Status.NOT_TRUSTED)
         status = np.where(np.asarray(found.status) == Status.GOOD, good, found.status)
         z = found.z()
+        if not z.size:
+            what, hint = "its draws have no unconstrained vectors", "give its BatchDraws a z"
+            raise FitError(what, where="method", hint=hint)
         parts = [
             self._moved(batch, z[:, begin : begin + DRAWS], sign, response)
             for sign in (1.0, -1.0)

@@ -20,7 +20,7 @@ from scipy.special import ndtri
 from polar_bayes.errors import CaptureError, FitError
 from polar_bayes.importers.detector import read_image
 from polar_bayes.inference.batching import IMAGE, Status, cut
-from polar_bayes.inference.result import CENTRAL_95, provenance_of
+from polar_bayes.inference.result import CENTRAL_95, Provenance, provenance_of
 from polar_bayes.maps.lazy import CHUNK, checked_status, map_parameters
 
 MOST_OF_SETUP = 0.5
@@ -116,14 +116,7 @@ def region_means(
         variables[f"{name}_interval"] = (("bound", *axes), interval, attrs)
         pull = np.where(means.is_pull_known, means.pull, np.nan)
         variables[f"{name}_prior_pull"] = (axes, pull, attrs)
-    share, error = worst
-    if share > MOST_OF_SETUP:
-        together = *(provenance_of(maps).get("shared") or {}), error
-        cautions.append(
-            f"Errors of the set-up make up to {share:.0%} of the variance of these means, most by "
-            f"{error}, and a map has them to first order only. Let the pixels determine that one, "
-            f"by shared={together!r}, or measure it."
-        )
+    cautions += _setup_cautions(provenance_of(maps), *worst)
     own = {dim: x for dim, x in maps.coords.items() if any(dim in v[0] for v in variables.values())}
     answer = xr.Dataset(variables, {**own, "region": found, "bound": list(CENTRAL_95)})
     return answer.isel(region=shown).assign_attrs(cautions=cautions)
@@ -222,9 +215,9 @@ def _sums_of(
         np.add.at(whole, region, x)
         return whole
 
-    mean, variance = values(name), values(f"{name}_sd") ** 2
-    shares = f"{name}_slope" in block
+    mean, shares = values(name), f"{name}_slope" in block
     slope = values(f"{name}_slope") if shares else np.zeros((0, *mean.shape))
+    variance = np.maximum(values(f"{name}_sd") ** 2 - np.sum(slope**2, axis=0), 0.0)  # its own
     prior_mean, prior_sd = (
         np.broadcast_to(block[name].attrs.get(f"prior_{part}", np.nan), mean.shape[1:] or (1,))
         for part in ("mean", "sd")
@@ -233,7 +226,7 @@ def _sums_of(
     gain = variance / np.maximum(prior_sd**2 - variance, 0.01 * prior_sd**2)
     return _Sums(
         total(mean),
-        total(np.maximum(variance - np.sum(slope**2, axis=0), 0.0)),
+        total(variance),
         np.reshape([total(each) for each in slope], (len(slope), count, *mean.shape[1:])),
         total(gain * (prior_mean - mean)),
         total(gain * variance),
@@ -270,6 +263,23 @@ def _error_share(maps: xr.Dataset, found: _Sums, shown: np.ndarray) -> tuple[flo
     shares = np.nan_to_num(shares.reshape(len(shares), -1))
     at = np.argmax(shares.sum(axis=0))
     return float(shares[:, at].sum()), str(names[is_error][np.argmax(shares[:, at])])
+
+
+def _setup_cautions(provenance: Provenance, share: float, error: str) -> Iterator[str]:
+    """Caution against errors of the set-up that a map has to first order, or averages out."""
+    shared = tuple(provenance.get("shared") or {})
+    if share > MOST_OF_SETUP:
+        yield (
+            f"Errors of the set-up make up to {share:.0%} of the variance of these means, most by "
+            f"{error}, and a map has them to first order only. Let the pixels determine that one, "
+            f"by shared={(*shared, error)!r}, or measure it."
+        )
+    if alone := provenance.get("of_each_pixel"):
+        yield (
+            f"Each pixel has its own {', '.join(alone)}, where one value should serve the image. "
+            "Its error averages out, so that intervals of these means may be too narrow. Let the "
+            f"pixels determine it together, by shared={(*shared, *alone)!r}."
+        )
 
 
 def _cautions(name: str, labels: np.ndarray, found: _Sums, shown: np.ndarray) -> Iterator[str]:

@@ -110,7 +110,10 @@ class IncidenceAngle(AbstractInputQuantity):
 
 @dataclasses.dataclass(frozen=True)
 class SampleLean(AbstractInputQuantity):
-    """Tilt of the sample's normal away from the light, in its plane; unit degree."""
+    """Tilt of the sample's normal away from the light, in its plane; unit degree.
+
+    Views are meant to be in that plane: the turn of the plane of a view aside is left out.
+    """
 
     name = "sample_lean"
 

@@ -379,12 +379,9 @@ def _expected_widths(views: xr.Dataset) -> tuple[str, np.ndarray, np.ndarray]:
 def next_sentences(fit: FitView) -> list[str]:
     """State what to measure next, and what of the set-up to know better."""
     sentences = [_views_sentence(fit.result)]
-    if "next_views" not in fit.result.children:
-        return sentences
-    found = fit.result["next_views"].to_dataset()
-    of_index = [str(x) for x in found["parameter"].to_numpy() if x.startswith("refractive_index")]
-    told = quantity_sentences(found.sel(parameter=of_index) if of_index else found)
-    return [*sentences, *told]
+    if "next_views" in fit.result.children:
+        sentences += quantity_sentences(fit.result["next_views"].to_dataset())
+    return sentences
 
 
 def trust(fit: FitView) -> str:

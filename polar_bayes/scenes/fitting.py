@@ -58,8 +58,9 @@ def fit(
         priors: Distributions that replace or extend `polar_bayes.priors.PRIORS`.
         links: One link for the polarization, or a mapping from variable to link.
         known: Standard uncertainties of what the set-up is known to, above 0, by input quantity,
-            such as `{"light_zenith": 0.2}` (degree); they replace those of the set-up. A capture
-            may state the same in its attributes, such as `light_zenith_uncertainty`.
+            such as `{"light_zenith": 0.2}` (degree); they replace those of the set-up and of
+            `priors`. A capture may state the same in its attributes, such as
+            `light_zenith_uncertainty`, but what is given here counts more.
         largest_view_zenith: Views beyond it are set aside and counted. Unit degree.
         seed: The same seed gives the same result on the same machine, unless "auto" ran out of
             time.

@@ -1,6 +1,7 @@
 """Scene files: a scene, its links, priors and method as one small TOML file.
 
     setup = "goniometer"                       # links, limit and priors that are not stated
+    quantities = "listed"                      # without it, those of the set-up are added
     method = "Nuts(max_tree_depth=10)"
 
     [scene]                                    # every part; one that is not listed is absent
@@ -33,7 +34,7 @@ import polar_bayes.physics
 from polar_bayes import methods
 from polar_bayes.errors import FitError, SceneError
 from polar_bayes.expressions import Known, parse_value, short_text
-from polar_bayes.inference.request import MODELS
+from polar_bayes.inference.request import MODELS, OWN_QUANTITIES
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.methods.method import AbstractBatchMethod
 from polar_bayes.observation import links
@@ -43,6 +44,9 @@ from polar_bayes.physics import input_quantities, instrument
 from polar_bayes.physics.scene import Scene
 from polar_bayes.priors import parse_prior
 from polar_bayes.setups import SETUPS, Setup, find_setup
+
+LISTED = "listed"
+"""Of input quantities: those of the scene alone, without those of its set-up."""
 
 
 @functools.cache
@@ -88,9 +92,9 @@ def load_scene(path: str | os.PathLike[str]) -> dict[str, Any]:
     Other functions take those that they have: `polar_bayes.identify` has no `method`.
 
     Args:
-        path: A TOML file with some of the keys setup, model, method, largest_view_zenith, scene,
-            links and priors. Parts, links, priors and settings are written as calls, as in a
-            program; they are parsed, never evaluated.
+        path: A TOML file with some of the keys setup, quantities, model, method,
+            largest_view_zenith, scene, links and priors. Parts, links, priors and settings are
+            written as calls, as in a program; they are parsed, never evaluated.
 
     Returns:
         Some of scene, model, method, largest_view_zenith, links and priors.
@@ -144,7 +148,10 @@ def _arguments(stated: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 def _scene_of(stated: Mapping[str, Any], where: str) -> str | Scene | Setup | None:
     """Return the scene with its set-up, by name if the set-up has that scene."""
-    base = stated.get("setup")
+    base, quantities = stated.get("setup"), stated.get("quantities", LISTED)
+    if quantities != LISTED:
+        what, hint = f"quantities is {quantities!r}", f"give {LISTED!r}, or leave it out"
+        raise SceneError(what, where=where, hint=hint)
     setup = None if base is None else find_setup(base)
     texts = _table(stated, "scene", where)
     if not texts:
@@ -165,6 +172,8 @@ def _scene_of(stated: Mapping[str, Any], where: str) -> str | Scene | Setup | No
         raise error.within(f"{where}: scene") from None
     if setup is None:
         return scene
+    if "quantities" in stated:
+        return dataclasses.replace(setup, scene=scene, known=())
     scene = scene.perfectly_known if scene.perfectly_known == setup.scene else scene
     return base if scene == setup.scene else dataclasses.replace(setup, scene=scene)
 
@@ -222,6 +231,10 @@ def scene_text(source: xr.DataTree | xr.Dataset | str) -> str:
     scene = parse_scene(parts, "scene")
     name = str(provenance.get("scene"))
     head = {"setup": name} if name in SETUPS else {}
+    head |= {"quantities": LISTED} if OWN_QUANTITIES in provenance.get("swapped", ()) else {}
+    if "quantities" in head and provenance.get("carried"):
+        what, hint = "its map carries input quantities of your own", "give its Setup in Python"
+        raise FitError(f"a file cannot describe it: {what}", where="scene", hint=hint)
     head |= {"model": model}
     if "method_parts" in provenance:
         method = parse_method(str(provenance["method_parts"]), "method")

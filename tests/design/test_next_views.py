@@ -251,6 +251,7 @@ def test_a_quantity_known_twice_as_well_does_what_its_prior_does(plate: xr.Datas
     links = {"q": pb.links.StokesLink(stated_errors=True)}
     setup = pb.setups.Setup(PLATE, links, known=(SampleLean(), ToneCurve()))
     asked = {"scene": setup, "count": 1, "draws": 4}
+    plate = plate.assign_attrs(setup="picture")  # whose quantities are not those of the fit
     fit = pb.fit(plate, scene=setup, method="laplace")
     found = pb.next_views(plate, result=fit, **asked)
     assert found["quantity"].to_numpy().tolist() == ["sample_lean_offset", "tone_curve_offset"]

@@ -131,6 +131,35 @@ def test_each_factor_of_a_normal_posterior_contributes_its_precision() -> None:
     np.testing.assert_allclose(np.square(found), expected, rtol=1e-6)
 
 
+@each("factor", [1e-300, 1e-4, 0.1, 1.0, 3.0, 10.0, 1e6])
+def test_a_quantity_that_readings_do_not_tell_may_be_known_to_anything(factor: float) -> None:
+    """Half of the variance comes from it; draws tell its slope, and what readings add to it."""
+    rng, stated, draws = np.random.default_rng(7), pd.Series({"light_zenith": 1.0}), 2000
+    z = rng.normal(size=(2, draws))
+    joint = np.cov(np.stack([0.5 * z[0] + 0.5 * z[1], z[1]]))
+    sd, _, _, _, part, _ = _row(joint, 1.0, stated, factor * stated)
+    # Its precision, in units of the prior's, is known to so much, and the slope to this factor.
+    off, slack = 5.0 * np.sqrt(2.0 / draws), 1.0 + 5.0 / np.sqrt(draws)
+    least = factor / np.sqrt(1.0 + off * factor**2)
+    assert 0.5 * np.hypot(1.0, least) / slack < sd < 0.5 * np.hypot(1.0, factor) * slack
+    assert 0.0 <= part < 0.5 * slack * max(factor, 1e-6)
+
+
+def test_what_has_no_budget_is_told(capture, fit) -> None:
+    for known, said in (
+        ("light_zenith=0.2", "known: it is 'light_zenith=0.2'; give a mapping"),
+        ({"sample_lean_offset": 0.2}, "it is no input quantity of this fit"),
+    ):
+        with pytest.raises(pb.FitError, match=said):
+            pb.budget(fit, known=known)
+    with pytest.raises(
+        pb.FitError, match="no input quantity of this scene; give it as sample_lean"
+    ):
+        pb.fit(capture, known={"sample_lean_offset": 0.2}, **ASKED)
+    with pytest.raises(pb.FitError, match="a point fit has no intervals"):
+        pb.budget(pb.fit(capture, **ASKED | {"method": "point"}))
+
+
 def test_a_discrepancy_has_a_column_of_its_own() -> None:
     result = make_result(wavelengths=(), views=12, draws=300, variables=("dop",), discrepancy=True)
     posterior = result["posterior"].to_dataset()

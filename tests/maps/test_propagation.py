@@ -98,6 +98,9 @@ def test_means_that_are_no_better_than_the_set_up_are_cautioned(usual: xr.Datase
     assert "shared=('light_zenith_offset',)" in caution
     few = pb.maps.region_means(usual, np.eye(2, dtype=bool))
     assert not [text for text in few.attrs["cautions"] if "of the set-up" in text]
+    # So small an image shares no gain of its polarizer, either.
+    (caution,) = (text for text in few.attrs["cautions"] if text.startswith("Each pixel has its"))
+    assert "its own dolp_gain, where one value should serve" in caution
 
 
 def test_maps_tell_what_the_set_up_contributes(usual: xr.Dataset) -> None:

@@ -110,6 +110,12 @@ def test_pixels_that_are_alike_are_told() -> None:
     assert float(found["level_interval"][1, 0]) < 0.2
     (sentence,) = found.attrs["cautions"]
     assert sentence.startswith("level of region leaf: if its pixels are alike, their priors move")
+    # A common error moves pixels, but not by how far their priors pull.
+    error = maps["level_sd"].mean().item() * xr.ones_like(maps["level"]).expand_dims(shared=1)
+    wider = np.hypot(maps["level_sd"], error[0])
+    moved = maps.assign(level_sd=wider, level_slope=error).assign_attrs(maps.attrs)
+    moved = pb.maps.region_means(moved, np.full((SIDE, SIDE), "leaf"))
+    np.testing.assert_allclose(moved["level_prior_pull"], found["level_prior_pull"], rtol=1e-5)
 
 
 def test_regions_of_a_store_and_pixels_without_an_answer(maps: xr.Dataset, tmp_path: Path) -> None:

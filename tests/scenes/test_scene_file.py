@@ -11,6 +11,7 @@ from plates import plate_capture
 from synthetic_results import edit_provenance
 
 import polar_bayes as pb
+from polar_bayes.inference.request import OWN_QUANTITIES
 from polar_bayes.inference.result import provenance_of
 from polar_bayes.setups import SETUPS
 
@@ -38,6 +39,19 @@ def test_a_fit_by_the_file_of_a_fit_has_the_same_draws(fitted, tmp_path: Path):
         assert own[key] == other[key]
 
 
+def test_a_file_keeps_the_input_quantities_of_a_set_up(tmp_path: Path):
+    """Those of the set-up that it names are added to a scene, unless the file says otherwise."""
+    setup, few = SETUPS["picture"], SETUPS["picture"].known[1:2]
+    asked = {"method": pb.methods.Laplace(draws=50), "links": {"q": pb.links.StokesLink()}}
+    fitted = pb.fit(PLATE, scene=dataclasses.replace(setup, known=few), **asked)
+    pb.save_scene(fitted, tmp_path / "few.toml")
+    stated = pb.load_scene(tmp_path / "few.toml")
+    assert stated["scene"].scene == setup.scene.known_to(few)
+    again = pb.fit(PLATE, **stated)
+    assert again["posterior"].equals(fitted["posterior"])
+    assert OWN_QUANTITIES in provenance_of(again)["swapped"]
+
+
 @pytest.mark.thorough
 def test_what_a_file_states_as_it_is_shipped_is_not_swapped(tmp_path: Path):
     file = tmp_path / "plate.toml"
@@ -57,6 +71,7 @@ def test_the_file_of_a_set_up_names_it(name, tmp_path: Path):
 
 WRONG = {
     "setup =": "it is no TOML",
+    "quantities = 'some'": "quantities is 'some'; give 'listed'",
     "setups = 'paper'": "there is no entry 'setups'; did you mean setup",
     "setup = 'papr'": "no such scene; give one of paper",
     "model = 'mine'": "no such model; give one of per_material",
