@@ -12,27 +12,27 @@ ROOT = Path(__file__).parents[1]
 CODE = {
     "benchmark": 580,
     "calibration": 1037,
-    "capture": 834,
+    "capture": 835,
     "cli": 1273,
     "design": 1135,
-    "diagnostics": 1879,
-    "importers": 2102,
-    "inference": 2784,
+    "diagnostics": 1886,
+    "importers": 2109,
+    "inference": 2785,
     "maps": 1940,
     "methods": 1280,
     "numerics": 1006,
     "observation": 515,
     "physics": 2766,
     "reporting": 3272,
-    "scenes": 1782,
+    "scenes": 1796,
     "own files": 1607,
     "models": 332,
-    "tests": 23301,
+    "tests": 23331,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 26120,
+    "code": 26150,
     "classes": 336,
     "constants": 428,
     "Any": 178,
@@ -44,8 +44,8 @@ The plan was 20,500 lines of code, 290 classes and 180 `Any`, for a package that
 Since then features came that were chosen over it: readers of other people's files (900 lines),
 the set-up in the interval (210) and in maps (250), a map to point at (290), second bounces and
 passages (220), programs on the disk (90), exposures that are set for the light (40), what is known
-better beside further views (70), and set-ups of the user's own that files, views and regions keep
-(50). The other rooms became smaller by a few lines only.
+better beside further views (70), and set-ups of the user's own that files, views and regions keep,
+films after auto, and curves that files state (80). The other rooms became smaller by a few lines only.
 """
 
 

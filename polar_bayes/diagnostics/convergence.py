@@ -103,6 +103,7 @@ def verdict(fit: FitView) -> Verdict:
         *_edges(provenance.get("counts", {}), many=True),
         *setup_cautions(provenance),
         *provenance.get("capture_cautions", ()),
+        *provenance.get("scene_cautions", ()),
         *against.get("caution", []),
         *dict.fromkeys(against.get("not computed", [])),
     )

@@ -477,13 +477,22 @@ def _alternatives(fit: FitView, absent: Sequence[Scalar]) -> Finding:
         + _swap_text(row["alternative"], row["part"])
         for label, row in undecided.sort_values("log_bayes_factor", ascending=False).iterrows()
     ]
-    whose = "; the index is that of the outermost interface, which under a film is the film's"
     sentence = (
         f"The answer rests on a part that the readings do not decide: {listed(answers)}"
-        f"{whose * bool(undecided['alternative'].str.contains('film').any())}; unless "
+        f"{whose_index(list(undecided['alternative']))}; unless "
         "you know the part, report both answers, as polar_bayes.compare_scenes gives them."
     )
     return Finding("caution" if weighty.any() else "note", p_value, highest, sentence)
+
+
+def whose_index(scenes: Sequence[str]) -> str:
+    """State whose index a bare scene finds under the films that scenes name; empty without any."""
+    said = {
+        "water film": "that of the outermost interface, the film's",
+        "thin film": "neither the film's nor the body's",
+    }
+    there = (film for film in said if any(film in name for name in scenes))
+    return "".join(f"; under a {film}, the index of a bare scene is {said[film]}" for film in there)
 
 
 def _swap_text(alternative: str, part: str) -> str:

@@ -103,7 +103,7 @@ def read_image(
             with Image.open(file, formats=formats) as image:
                 mode, pages = image.mode, getattr(image, "n_frames", 1)
                 is_frame = mode in gray and pages == 1
-                curve = stated_curve(image) if is_frame else ""
+                curve = stated_curve(image)
                 values = np.asarray(image) if is_frame else None
     except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
         hint = "cut it to what matters, or give it as .npy"
@@ -118,11 +118,14 @@ def read_image(
         raise CaptureError("it cannot be read as an image", where=str(file), hint=hint) from error
     if values is not None:
         return values, curve
+    what, hint = f"it holds {pages} frames", "save each page as a file of its own"
     if mode not in gray:
-        hint = "save it with 8 or 16 bits of gray, or give one channel as .npy"
-        raise CaptureError(f"its pixels are {mode}, not gray values", where=str(file), hint=hint)
-    hint = "save each page as a file of its own"
-    raise CaptureError(f"it holds {pages} frames", where=str(file), hint=hint)
+        stated = (
+            f", and state by transfer= the curve that the copy does not ({curve})" if curve else ""
+        )
+        hint = f"save it with 8 or 16 bits of gray, or give one channel as .npy{stated}"
+        what = f"its pixels are {mode}, not gray values"
+    raise CaptureError(what, where=str(file), hint=hint)
 
 
 # --- Correction and noise -------------------------------------------------------------------------
@@ -138,7 +141,8 @@ class Detector:
         dark: A frame without light, to be taken off: the mean of several, so that its own noise is
             small. A number is the same for all pixels.
         flat: A frame of even unpolarized light, already less its dark frame: the sensitivity of
-            each pixel; its scale does not matter.
+            each pixel; its scale does not matter. Where a curve is undone, the difference of counts
+            serves as far as the dark frame is small beside it.
         gain: Counts per electron, > 0; by default the saturation level over 10,000 electrons.
         read_noise: Standard deviation of a pixel without light, in counts, >= 0.
         relative_error: What stays unknown of every reading however many pixels are averaged, over
@@ -216,7 +220,7 @@ def signal_of(frames: Sequence[np.ndarray], level: float | None, detector: Detec
         raise CaptureError(f"it reaches the full count {full:g}", where="dark", hint=hint)
     flat = _flat(detector, shape, linear)
     half = 0.5 * step if full > 1.0 else 0.0  # shares of full light are no whole numbers
-    rounding = linear(raw + half) - linear(raw - half)
+    rounding, saturated = linear(raw + half) - linear(raw - half), raw >= full
     raw, dark, full = linear(raw), linear(dark), float(linear(np.array(float(full))))
     # Electrons that fill a pixel of a machine-vision sensor.
     gain = full / 10_000.0 if detector.gain is None else float(detector.gain)
@@ -225,7 +229,7 @@ def signal_of(frames: Sequence[np.ndarray], level: float | None, detector: Detec
     return Signal(
         light=counts / flat,
         variance=variance / flat**2,
-        saturated=raw >= full,
+        saturated=saturated,
         full_scale=float(np.max((full - dark) / flat)),
         metadata={
             **transfer.metadata,

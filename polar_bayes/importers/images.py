@@ -467,12 +467,13 @@ def _spectral(captures: Sequence[xr.Dataset]) -> xr.Dataset:
     """Combine the captures of all colors along wavelength, and count masked readings."""
     kept = [name for name in captures[0].data_vars if str(name).endswith(("zenith", "azimuth"))]
     colors = xr.concat([each.drop_vars(kept) for each in captures], "wavelength")
-    attributes = dict(captures[0].attrs)
+    attributes = {name: x for each in reversed(captures) for name, x in each.attrs.items()}
     for name in attributes:
+        of_colors = [each.attrs[name] for each in captures if name in each.attrs]
         if str(name).startswith("masked_") or name == "dop_at_one":
-            attributes[name] = sum(int(each.attrs[name]) for each in captures)
+            attributes[name] = sum(map(int, of_colors))
         elif str(name).startswith(("measured_gamma", "median_misfit")):
-            attributes[name] = float(np.median([each.attrs.get(name, np.nan) for each in captures]))
+            attributes[name] = float(np.median(of_colors))  # dark colors may not tell theirs
     merged = xr.merge([captures[0][kept].drop_vars("wavelength"), colors]).assign_attrs(attributes)
     return validate(merged, source=str(attributes["name"]))
 

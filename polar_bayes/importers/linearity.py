@@ -49,11 +49,11 @@ def restoring_exponent(
         used: Pixels neither saturated nor dark, (row, column).
 
     Returns:
-        Both numbers; None where angles are not redundant, light does not determine an exponent from
-        0.2 to 5, or residuals contradict that there is one.
+        Both numbers; None for a line of pixels, where angles are not redundant, light does not
+        determine an exponent from 0.2 to 5, or residuals contradict that there is one.
     """
     used = used & (light > 0.0).all(axis=0)
-    if len(angles) < 4 or used.sum() < 100 * (len(angles) - 3):
+    if len(angles) < 4 or used.sum() < 100 * (len(angles) - 3) or min(used.shape) < 2:
         return None
     relative = noise[:, used] / light[:, used].mean(axis=0) ** 2
     variances = relative, relative + max(error, 0.003) ** 2

@@ -11,9 +11,10 @@ on a scale on which white keeps its count. Counts below zero, which averaged dar
 are those of the same light below zero.
 
 PNG states a curve by its chunks sRGB, gAMA (1/G) or iCCP, TIFF by an ICC profile or the tag
-TransferFunction, EXIF by ColorSpace; a JPEG has one even where it states none. Pillow applies none
-of them, and a file that Pillow writes again lacks sRGB, gAMA and EXIF, so a file that states no
-curve may have one. `polar_bayes.importers.linearity` tests it.
+TransferFunction, EXIF by ColorSpace, its interoperability index or Gamma; a JPEG has one even where
+it states none. Pillow applies none of them, does not see the chunk cICP, and a file that Pillow
+writes again lacks sRGB, gAMA and EXIF, so a file that states no curve may have one.
+`polar_bayes.importers.linearity` tests it.
 
 Source:
     IEC 61966-2-1:1999 (sRGB); W3C, Portable Network Graphics (PNG) Specification, section 11.3.2.
@@ -90,14 +91,17 @@ def as_transfer(transfer: object) -> Transfer:
 def stated_curve(image: Image.Image) -> str:
     """Return the tone curve that an image states; empty if none."""
     info, exif = image.info, image.getexif()
-    gamma = info.get("gamma", 1.0)  # 1 is linear
-    color_space = exif.get_ifd(0x8769).get(0xA001, exif.get(0xA001))
+    more = exif.get_ifd(0x8769)
+    gamma, exponent = info.get("gamma", 1.0), float(more.get(0xA500, 1.0))  # 1 is linear
+    color_space = more.get(0xA001, exif.get(0xA001))
     found = {
         "sRGB": "srgb" in info,
         f"gAMA {gamma:g}": abs(gamma - 1.0) > 1e-3,
+        f"EXIF Gamma {exponent:g}": abs(exponent - 1.0) > 1e-3,
         "ICC profile": "icc_profile" in info,
         "TransferFunction": 0x012D in exif,
         "EXIF ColorSpace sRGB": color_space == 1,
+        "EXIF ColorSpace Adobe RGB": color_space == 2 or exif.get_ifd(0xA005).get(1) == "R03",
         "JPEG": image.format in ("JPEG", "MPO"),
     }
     return ", ".join(name for name, is_stated in found.items() if is_stated)

@@ -364,6 +364,7 @@ _FIT_PROVENANCE: Mapping[str, Spec] = {
     "fixed?": {EACH: ANY},
     "scene_chosen_by?": TEXT,
     "capture_cautions?": [TEXT],
+    "scene_cautions?": [TEXT],
     "indices_by_eye?": {EACH: INDEX_BY_EYE},
     "swapped?": [TEXT],
     "largest_view_zenith?": FINITE,

@@ -1,6 +1,7 @@
 """Results of a comparison of scenes, as a table and in sentences."""
 
 import dataclasses
+import itertools
 import json
 from collections.abc import Iterator, Mapping
 
@@ -9,6 +10,7 @@ import pandas as pd
 import xarray as xr
 from numpyro import distributions as dist
 
+from polar_bayes.diagnostics.criticism import whose_index
 from polar_bayes.diagnostics.finding import listed
 from polar_bayes.inference.request import Request
 from polar_bayes.physics.scene import Scene
@@ -158,9 +160,7 @@ def scene_sentences(result: xr.DataTree | SceneComparison) -> list[str]:
     others = found.sel(scene=[name for name in found["scene"].to_numpy() if name in gone])
     sentences += [_why_not(others.sel(scene=name)) for name in others["scene"].to_numpy()[:4]]
     if undecided:
-        hidden = any("film" in name for name in undecided)
-        whose = "; the index is that of the outermost interface, the film's where there is one"
-        sentences.append(f"The readings do not decide {listed(undecided)}{whose * hidden}.")
+        sentences.append(f"The readings do not decide {listed(undecided)}{whose_index(undecided)}.")
     sentences += _escaped(found, chosen)
     if len(remaining) > 1:
         sentences += _between(found)
@@ -175,6 +175,24 @@ def scene_sentences(result: xr.DataTree | SceneComparison) -> list[str]:
         names = ", ".join(name for name, reason in left_out.items() if reason == why)
         sentences.append(f"{names} could not be fitted: {why}.")
     return sentences
+
+
+def film_cautions(comparison: SceneComparison) -> list[str]:
+    """Caution against films that the readings do not decide and that would move the index."""
+    films = [name for name in (*comparison.undecided, *comparison.weights) if "film" in name]
+    bare = next((name for name in comparison.weights if name not in films), "")
+    if not films or not bare:
+        return []
+    found, answers = comparison.to_dataset(), []
+    own = found.sel(scene=bare)
+    indices = [str(x) for x in own["parameter"].to_numpy() if x.startswith("refractive_index")]
+    for label, film in itertools.product(indices, films):
+        low, mean, high = (float(own[end].sel(parameter=label)) for end in ("low", "mean", "high"))
+        other = float(found["mean"].sel(scene=film, parameter=label))
+        if other < low or other > high:
+            answers.append(f"{label} is {other:.3g} by {film}, and {mean:.3g} by {bare}")
+    said = f"The readings do not decide a film: {listed(answers)}{whose_index(films)}."
+    return [said] if answers else []
 
 
 def _why_not(scene: xr.Dataset) -> str:

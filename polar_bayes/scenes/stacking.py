@@ -26,6 +26,7 @@ from polar_bayes.progress import Progress
 from polar_bayes.scenes.comparison import FitArguments, compare_candidates
 from polar_bayes.scenes.fit_request import Keep, fit_request
 from polar_bayes.scenes.neighbors import STOPPED, try_alternatives
+from polar_bayes.scenes.sentences import film_cautions
 
 OF_DRAWS = (
     *("posterior", "sample_stats", "log_prior", "log_likelihood"),
@@ -77,7 +78,8 @@ def fit_best_scenes(
         }
         result = next(iter(fits.values())) if alone else stack_fits(fits, weights)
         result["scenes"] = xr.DataTree(comparison.to_dataset())
-        _add_provenance(result, scene="auto", alternatives_failed=STOPPED)
+        cautions = film_cautions(comparison)
+        _add_provenance(result, scene="auto", alternatives_failed=STOPPED, scene_cautions=cautions)
         if keep is not None:
             keep(result.copy())
         request = comparison.requests[max(weights, key=lambda name: weights[name])]

@@ -376,5 +376,5 @@ def test_an_undecided_part_is_a_caution_by_its_evidence_or_by_what_it_hides(
     assert found.loc["alternatives", "level"] == level
     sentence = found.loc["alternatives", "sentence"]
     moves, is_film = abs(shift) > 1.96, other is FILM and level != "passed"
-    assert ("the index is that of the outermost interface" in sentence) == (is_film and moves)
+    assert ("the index of a bare scene is" in sentence) == (is_film and moves)
     assert ("the answer is the same with it" in sentence) == (is_film and not moves)

@@ -17,6 +17,7 @@ import polar_bayes as pb
 from polar_bayes.capture.plausibility import cautions
 from polar_bayes.errors import CaptureError
 from polar_bayes.importers.detector import read_frame
+from polar_bayes.importers.images import _spectral
 from polar_bayes.importers.linearity import restoring_exponent
 from polar_bayes.importers.transfer import as_transfer
 
@@ -47,9 +48,10 @@ def saved(kind: str, **settings) -> bytes:
     return file.getvalue()
 
 
-def exif(color_space: int) -> Image.Exif:
+def exif(color_space: int, gamma: float = 1.0) -> Image.Exif:
     found = Image.Exif()
     found[0xA001] = color_space
+    found.get_ifd(0x8769)[0xA500] = gamma
     return found
 
 
@@ -58,6 +60,8 @@ CURVED = {
     "gAMA 0.45455": png(b"gAMA", struct.pack(">I", 45455)),
     "ICC profile": saved("PNG", icc_profile=ICC),
     "EXIF ColorSpace sRGB": saved("PNG", exif=exif(1)),
+    "EXIF ColorSpace Adobe RGB": saved("PNG", exif=exif(2)),
+    "EXIF Gamma 2.2": saved("PNG", exif=exif(0xFFFF, gamma=2.2)),
     "ICC profile.tif": saved("TIFF", icc_profile=ICC),
     "JPEG": saved("JPEG"),
 }
@@ -80,6 +84,15 @@ def test_a_frame_that_states_a_curve_is_refused_unless_a_transfer_is_given(name,
         values, level = read_frame(path, "frame", transfer)
         np.testing.assert_allclose(values, np.asarray(GRAY), atol=2.0 if name == "JPEG" else 0.0)
         assert level == 255.0
+
+
+def test_a_color_picture_is_refused_with_its_curve(tmp_path: Path):
+    """A copy of one channel would not state it."""
+    path = tmp_path / "frame.jpg"
+    Image.merge("RGB", [GRAY] * 3).save(path, "JPEG")
+    said = r"its pixels are RGB.* one channel as .npy, and state by transfer= the curve .*\(JPEG\)"
+    with pytest.raises(CaptureError, match=said):
+        read_frame(path, "frame")
 
 
 @each("name", PLAIN)
@@ -114,7 +127,7 @@ def imported(frames, **detector) -> xr.Dataset:
     )  # fmt: skip
 
 
-@each("full", [255.0, 250.0])
+@each("full", [255.0, 250.0, 238.0])
 def test_an_srgb_capture_of_8_bits_is_the_linear_one_to_quantization(full: float):
     """Frames, dark and saturation level go through the curve; half a count is the bound."""
     dark, limit = as_transfer("srgb").linear(np.array([30.0, full]), 255.0)
@@ -193,6 +206,21 @@ def test_frames_with_a_curve_are_cautioned_with_the_gamma_that_mends_them():
     assert "import them with transfer='linear'" in sentence
 
 
+def test_an_exponent_below_1_is_no_curve_that_could_be_undone():
+    assert 0.85 < picture(0, e=1.0 / 0.9).attrs["measured_gamma"] < 0.95
+    assert not cautions(picture(0, e=1.0 / 0.9))
+
+
+def test_colors_that_are_dark_leave_the_gamma_to_the_others():
+    colors = [
+        picture(k, e=1.0 / 2.2).assign_coords(wavelength=w) for k, w in enumerate((460.0, 610.0))
+    ]
+    del colors[0].attrs["measured_gamma"], colors[0].attrs["measured_gamma_error"]
+    merged = _spectral(colors)
+    assert merged.attrs["measured_gamma"] == colors[1].attrs["measured_gamma"]
+    assert any("have a gamma of 2." in each for each in cautions(merged))
+
+
 @each(("curve", "cautioned"), [(lambda x: x, False), (encoded, True)], ids=["linear", "srgb"])
 def test_a_mosaic_that_is_partly_saturated(curve, cautioned: bool):
     frames = np.rint(255.0 * curve(np.clip(np.kron(scene(1)[0] / 600.0, np.ones((4, 4))), 0, 1)))
@@ -213,3 +241,5 @@ def test_light_that_is_not_polarized_or_not_redundant_says_nothing():
     curved = (mean + np.sqrt(noise) * rest) ** 0.45
     assert restoring_exponent(curved, 0.04 * noise / mean, 0.01, FOUR, everywhere) is None
     assert restoring_exponent(light[:3], noise[:3], 0.01, FOUR[:3], everywhere) is None
+    line = (each.reshape(4, 1, -1) for each in scene(0, e=0.45))
+    assert restoring_exponent(*line, 0.01, FOUR, everywhere.reshape(1, -1)) is None

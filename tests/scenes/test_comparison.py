@@ -16,7 +16,7 @@ import polar_bayes as pb
 from polar_bayes.scenes import comparison as selection
 from polar_bayes.scenes.comparison import FitArguments, between_scenes, stacking_weights
 from polar_bayes.scenes.library import SceneLibrary
-from polar_bayes.scenes.sentences import SceneComparison
+from polar_bayes.scenes.sentences import SceneComparison, film_cautions
 from polar_bayes.scenes.stacking import stack_fits
 
 MIRROR = pb.Scene(pb.SmoothSurface())
@@ -240,14 +240,23 @@ def test_a_film_that_is_as_good_as_none_is_said_and_does_not_remain(monkeypatch,
 def test_whose_index_it_is_is_said_where_a_film_is_not_decided(comparison) -> None:
     assert "The readings do not decide mirror." in said_of(comparison, undecided=("mirror",))
     film = {"mirror": "mirror + water film"}
-    said = said_of(
-        comparison,
-        table=comparison.table.rename(index=film),
-        intervals=comparison.intervals.rename(index=film),
-        scenes={"mirror + water film": MIRROR, "with body": PLATE},
-        undecided=("mirror + water film",),
-    )
-    assert "the index is that of the outermost interface, the film's where there is one" in said
+    told = {
+        "table": comparison.table.rename(index=film),
+        "intervals": comparison.intervals.rename(index=film),
+        "scenes": {"mirror + water film": MIRROR, "with body": PLATE},
+        "undecided": ("mirror + water film",),
+    }
+    whose = "under a water film, the index of a bare scene is that of the outermost interface"
+    assert whose in said_of(comparison, **told)
+    # The verdict cautions where the film would move the index, and only there.
+    with_film = dataclasses.replace(comparison, **told)
+    own = with_film.intervals.xs("refractive_index").loc["with body"]
+    for mean, is_moved in ((own["mean"], False), (own["q97.5"] + 0.01, True)):
+        intervals = with_film.intervals.copy()
+        intervals.loc[("refractive_index", "mirror + water film"), "mean"] = mean
+        cautions = film_cautions(dataclasses.replace(with_film, intervals=intervals))
+        assert len(cautions) == is_moved
+        assert not is_moved or f"and {own['mean']:.3g} by with body; under a" in cautions[0]
 
 
 @pytest.mark.thorough

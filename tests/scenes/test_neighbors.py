@@ -133,7 +133,7 @@ def test_a_film_of_water_that_hides_the_index_is_named() -> None:
     row = criticize(fit).loc["alternatives"]
     assert row["level"] == "caution"
     assert "with a water film" in row["sentence"]
-    assert "the index is that of the outermost interface" in row["sentence"]
+    assert "is that of the outermost interface, the film's" in row["sentence"]
     assert any("water film" in caution for caution in pb.verdict(fit).cautions)
     water = alternatives(fit).set_index("alternative", append=True).xs("water film", level=1)
     truth = float(fit["constant_data"]["true_refractive_index"])
