@@ -45,7 +45,7 @@ Since then features came that were chosen over it: readers of other people's fil
 the set-up in the interval (210) and in maps (250), a map to point at (290), second bounces and
 passages (220), programs on the disk (90), exposures that are set for the light (40), what is known
 better beside further views (70), and set-ups of the user's own that files, views and regions keep,
-films after auto, and curves that files state (80). The other rooms became smaller by a few lines only.
+films after auto, and curves that files state (80). The other rooms became smaller by a few lines.
 """
 
 
