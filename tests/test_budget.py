@@ -20,19 +20,19 @@ CODE = {
     "inference": 2785,
     "maps": 1940,
     "methods": 1280,
-    "numerics": 1006,
+    "numerics": 1007,
     "observation": 515,
     "physics": 2766,
     "reporting": 3272,
     "scenes": 1796,
     "own files": 1607,
     "models": 332,
-    "tests": 23331,
+    "tests": 23333,
 }
 """Most lines by room that are neither blank, comment, docstring nor import."""
 
 WHOLE = {
-    "code": 26150,
+    "code": 26151,
     "classes": 336,
     "constants": 428,
     "Any": 178,

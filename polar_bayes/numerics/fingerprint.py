@@ -36,7 +36,8 @@ def _plain(value: object, above: tuple[object, ...] = ()) -> object:
     """Replace functions and classes in a value by their names; the value may contain itself."""
     # A token is made of a pickle that is read again. That of a class of a notebook would give the
     # class new methods, which no longer see what is edited there.
-    if callable(value) and hasattr(value, "__qualname__"):
+    is_handler = isinstance(value, Messenger)  # it has the name of what it wraps
+    if callable(value) and hasattr(value, "__qualname__") and not is_handler:
         return f"{value.__module__}.{value.__qualname__}"
     if any(value is each for each in above):
         return _plain(type(value))
@@ -49,8 +50,8 @@ def _plain(value: object, above: tuple[object, ...] = ()) -> object:
         parts = (value.func, value.args, value.keywords)
     elif dataclasses.is_dataclass(value):
         parts = tuple((each.name, getattr(value, each.name)) for each in dataclasses.fields(value))
-    elif isinstance(value, Messenger) or not _is_installed(type(value).__module__):
-        parts = getattr(value, "__dict__", {})
+    elif is_handler or not _is_installed(type(value).__module__):
+        parts = {n: x for n, x in getattr(value, "__dict__", {}).items() if n[:2] != "__"}
     else:
         return value
     return [_plain(type(value)), _plain(parts, (*above, value))]
