@@ -30,6 +30,7 @@ from polar_bayes.physics.input_quantities import (
     PolarizationLoss,
     ToneCurve,
     ViewZenithScale,
+    quantity_of,
 )
 from polar_bayes.physics.instrument import (
     Analyzer,
@@ -245,7 +246,7 @@ def _priors_known_to(
     every = {**PRIORS, **own}
     own_terms = parameters_of(*setup.scene.terms)
     usual = {name: every[name] for name in own_terms if name in every}
-    names = {name.removesuffix("_offset"): name for name in usual if _is_error(usual[name])}
+    names = {quantity_of(name): name for name in usual if _is_error(usual[name])}
     stated = {name: capture.attrs.get(f"{name}_uncertainty") for name in names}
     stated = {name: u for name, u in stated.items() if u is not None} | dict(known)
     found = {}
@@ -254,7 +255,7 @@ def _priors_known_to(
         if name not in names:
             hint = f"give some of {', '.join(names)}" if names else "a scene's terms state them"
             if name in names.values():
-                hint = f"give it as {name.removesuffix('_offset')}"
+                hint = f"give it as {quantity_of(name)}"
             elif name in usual:  # no error around zero
                 hint = f"state its prior, by priors={{{name!r}: ...}}"
             raise FitError("no input quantity of this scene", where=where, hint=hint)

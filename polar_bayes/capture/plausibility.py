@@ -321,15 +321,17 @@ def _gamma_cautions(capture: xr.Dataset) -> Iterator[str]:
     )
     off = abs(np.log(gamma / undone))
     # Tone curves compress: an exponent below 1 has another cause, such as an object that moved.
-    is_curve = gamma > 1.0 or (gamma > 0.85 and undone != 1.0)
-    if "measured_gamma" in capture.attrs and is_curve and off > max(0.05, 5.0 * error / gamma):
-        remedy = "'linear'" if gamma < 1.05 else f"{gamma:.2g}"
+    if "measured_gamma" in capture.attrs and gamma > 0.85 and off > max(0.05, 5.0 * error / gamma):
+        transfer = "'linear'" if gamma < 1.05 else f"{gamma:.2g}"
         pictures = " (transfer='srgb' where they are pictures)" if 1.8 < gamma < 2.6 else ""
+        remedy = f"import them with transfer={transfer}{pictures}"
+        if gamma < 1.05 and undone == 1.0:  # they are read as linear already
+            remedy = "no tone curve has it: look for a wrong dark level or an object that moved"
         yield (
             "Light behind the analyzers contradicts that counts are in proportion to it, as they "
             f"are taken to be (transfer function: {capture.attrs.get('transfer', 'linear')}): the "
             f"frames have a gamma of {gamma:.2f} +- {error:.1g}, and q and u are wrong by about "
-            f"{abs(undone / gamma - 1.0):.0%}; import them with transfer={remedy}{pictures}."
+            f"{abs(undone / gamma - 1.0):.0%}; {remedy}."
         )
 
 

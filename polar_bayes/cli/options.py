@@ -59,11 +59,11 @@ class Assignment(click.ParamType):
     @override
     def convert(self, value: str | Path, param: Param, ctx: Context) -> tuple[str, str | float]:
         where, hint = f"{_flag(param)} {value}", "write it as --known light_zenith=0.2"
+        if not self.is_number:
+            hint = "write NAME=DISTRIBUTION, such as 'angle_zero=Normal(0,3)'"
         name, equals, text = str(value).partition("=")
         if not (equals and name.strip().isidentifier()):
             if self.is_named:
-                if not self.is_number:
-                    hint = "write NAME=DISTRIBUTION, such as 'angle_zero=Normal(0,3)'"
                 raise FitError("it does not say of what", where=where, hint=hint)
             return "", str(value)
         try:

@@ -29,6 +29,7 @@ from polar_bayes.diagnostics.sensitivity import total_density
 from polar_bayes.diagnostics.view import FitView, once, view_of
 from polar_bayes.errors import FitError
 from polar_bayes.frames import PrintedFrame
+from polar_bayes.physics.input_quantities import quantity_of
 from polar_bayes.physics.part import notation
 from polar_bayes.setups import check_known, check_uncertainty
 
@@ -100,7 +101,7 @@ def _errors(fit: FitView) -> dict[str, Scalar]:
     """Return the draws of the input quantities, by name."""
     known = fit.provenance.get("known") or {}
     usable = (each for each in fit.scalars if (known.get(each.name) or 0.0) > 0.0)
-    return {each.name.removesuffix("_offset"): each for each in usable}
+    return {quantity_of(each.name): each for each in usable}
 
 
 def _stated(fit: FitView) -> pd.Series:
@@ -120,34 +121,31 @@ def _row(
     count, weights = len(stated), np.ones(len(joint) - 1 - len(stated))  # weights are last
     if not np.isfinite(joint).all():
         return [np.nan] * (4 + bool(weights.size) + 2 * count)
-    known, now = (pd.Series([*each, *weights]) for each in (stated, asked))
-    variance, parts = _known_otherwise(joint, known, now)
+    # In units of the priors. Readings only add to their precision: what the covariance of the draws
+    # has beyond 1 is Monte Carlo error, which a wider prior would multiply.
+    u, now = (np.array([*each, *weights]) for each in (stated, asked))
+    values, vectors = np.linalg.eigh(joint[1:, 1:] / np.outer(u, u))
+    posterior = (vectors * np.clip(values, 0.0, 1.0)) @ vectors.T
+    slopes = np.linalg.lstsq(joint[1:, 1:], joint[0, 1:])[0] * u
+
+    def known_to(ratio: np.ndarray) -> tuple[float, np.ndarray]:
+        change = posterior @ np.diag(ratio**-2.0 - 1.0)
+        other = np.linalg.solve(np.eye(u.size) + change, posterior)
+        return joint[0, 0] + slopes @ (other - posterior) @ slopes, other @ slopes / ratio
+
+    ratio = np.clip(now / u, 1e-6, 1e6)
+    variance, parts = known_to(ratio)
     own = joint[1 : count + 1, 1 : count + 1], joint[0, 1 : count + 1]
     perfect = joint[0, 0] - own[1] @ np.linalg.lstsq(*own)[0]
     rest = variance - np.sum(parts**2)
     variances = [variance, perfect, noise * rest, (1.0 - noise) * rest]
     variances += [np.sum(parts[count:] ** 2)] if weights.size else []
-    halves = [now.where(now.index != at, 0.5 * now) for at in range(count)]
-    halved = [_known_otherwise(joint, known, half)[0] for half in halves]
+    halved = [known_to(half)[0] for half in ratio * (1.0 - 0.5 * np.eye(count, u.size))]
     return [
         *np.sqrt(np.maximum(variances, 0.0)),
         *parts[:count],
         *np.sqrt(np.maximum(halved, 0.0)),
     ]
-
-
-def _known_otherwise(
-    joint: Float[np.ndarray, "n n"], stated: pd.Series, asked: pd.Series
-) -> tuple[float, Float[np.ndarray, " quantity"]]:
-    """Return variance and contributions for a parameter under other priors of input quantities."""
-    # In units of the priors. Readings only add to their precision: what the covariance of the draws
-    # has beyond 1 is Monte Carlo error, which a wider prior would multiply.
-    u, ratio = stated.to_numpy(), np.clip((asked / stated).to_numpy(), 1e-6, 1e6)
-    values, vectors = np.linalg.eigh(joint[1:, 1:] / np.outer(u, u))
-    own = (vectors * np.clip(values, 0.0, 1.0)) @ vectors.T
-    other = np.linalg.solve(np.eye(u.size) + own @ np.diag(ratio**-2.0 - 1.0), own)
-    slopes = np.linalg.lstsq(joint[1:, 1:], joint[0, 1:])[0] * u
-    return float(joint[0, 0] + slopes @ (other - own) @ slopes), other @ slopes / ratio
 
 
 def variance_shares(table: pd.DataFrame) -> pd.DataFrame:
@@ -159,12 +157,13 @@ def variance_shares(table: pd.DataFrame) -> pd.DataFrame:
 
 def _asked(stated: pd.Series, known: Mapping[str, float] | None) -> pd.Series:
     """Return standard uncertainties, with the caller's values where given."""
-    for name, value in check_known(known).items():
+    known = check_known(known)
+    for name, value in known.items():
         if name not in stated.index:
             hint = f"give some of {join(list(stated.index))}"
             raise FitError("it is no input quantity of this fit", where=f"known: {name}", hint=hint)
         check_uncertainty(value, f"known: {name}")
-    return pd.Series({**stated.to_dict(), **(known or {})}, dtype=float)
+    return pd.Series({**stated.to_dict(), **known}, dtype=float)
 
 
 def _share_of_noise(scalar: Scalar, densities: list[np.ndarray | None]) -> float:

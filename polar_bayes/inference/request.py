@@ -23,6 +23,7 @@ from polar_bayes.models.per_material import per_material
 from polar_bayes.numerics.compile import TRACING_LOCK, LRUCache
 from polar_bayes.observation.data import observe
 from polar_bayes.observation.links import AbstractLink
+from polar_bayes.physics.input_quantities import quantity_of
 from polar_bayes.physics.instrument import Discrepancy
 from polar_bayes.physics.part import parameters_of
 from polar_bayes.physics.scene import Scene
@@ -138,12 +139,12 @@ def resolve(
     function = model if callable(model) else _find_model(model)
     PriorTable(priors)  # refuses what names no priors
     known = check_known(known)  # and counts more: a scene file of a result lists every prior
-    given = {n: x for n, x in (priors or {}).items() if _quantity(n) not in known}
+    given = {n: x for n, x in (priors or {}).items() if quantity_of(n) not in known}
     usual = ({} if shared is None else _pixel_priors()) | default_priors(whole, capture, known)
     carried = set(whole.scene.parameters) - set(setup.scene.parameters)
     same = {n: x for n, x in {**PRIORS, **usual}.items() if _are_same(given.get(n), x)}
     own = {name: prior for name, prior in given.items() if name not in same}
-    asked = given.keys() | {name for name in usual if _quantity(name) in known}
+    asked = given.keys() | {name for name in usual if quantity_of(name) in known}
     every = usual | own | same
     stated = {name: prior for name, prior in every.items() if name not in carried}
     parts = ModelParts(function, setup.scene, stated, chosen)
@@ -152,7 +153,7 @@ def resolve(
         with TRACING_LOCK:
             key = parts.key(layout_of(data))
             found = _MODEL_INFO.of(key, lambda: inspect_model(parts, data))
-    by_capture = [n for n in map(_quantity, usual) if f"{n}_uncertainty" in capture.attrs]
+    by_capture = [n for n in map(quantity_of, usual) if f"{n}_uncertainty" in capture.attrs]
     swapped = {
         "scene": scene_name == "custom",
         OWN_QUANTITIES: others_known,
@@ -185,11 +186,6 @@ def resolve(
         precision=precision,
         shared=tuple(n for n in setup.shared if n in found.priors or n in carried),
     )
-
-
-def _quantity(parameter: object) -> str:
-    """Return the name by which `known` states the error of a parameter."""
-    return str(parameter).removesuffix("_offset")
 
 
 def _known_to(

@@ -20,6 +20,7 @@ from polar_bayes.inference.result import PROVENANCE, provenance_of
 from polar_bayes.numerics.psis import LEVELS
 from polar_bayes.observation.data import READINGS
 from polar_bayes.paths import as_path
+from polar_bayes.physics.input_quantities import quantity_of
 from polar_bayes.physics.scene import MATERIAL_PARAMETERS
 
 zarr = lazy_loader.load("zarr")  # 0.1 s that results of other kinds need not wait for
@@ -398,7 +399,7 @@ def setup_sentences(maps: xr.Dataset) -> list[str]:
     if shares.empty:
         return []
     parts = [
-        f"{row.sum():.0%} of that of {name} (most by {row.idxmax().removesuffix('_offset')})"
+        f"{row.sum():.0%} of that of {name} (most by {quantity_of(row.idxmax())})"
         for name, row in shares.iterrows()
     ]
     return [

@@ -64,6 +64,11 @@ class AbstractInputQuantity(AbstractInstrumentTerm):
         return parameters[self.parameters[0]]
 
 
+def quantity_of(parameter: object) -> str:
+    """Return the name of the quantity whose error a parameter is, as `known=` states it."""
+    return str(parameter).removesuffix("_offset")
+
+
 @dataclasses.dataclass(frozen=True)
 class LightZenith(AbstractInputQuantity):
     """Error of the light's zenith: it is larger than stated by `light_zenith_offset` degrees."""
